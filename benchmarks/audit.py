@@ -24,8 +24,9 @@ from twin.env.obstacles import ground_height
 from twin.env.physics import HuskyPhysics
 from twin.env.route_segments import RouteSegment
 from twin.env.task import control
+from twin.geometry.polyline import nearest_on_route, point_at
 from twin.geometry.poses import wrap_angle
-from twin.mjcf.world import PART_GROUP, World, nearest_on_route, point_at
+from twin.mjcf.world import PART_GROUP, World
 from twin.robot import BASE_HEIGHT
 from twin.runtime import bar
 from twin.types import Array

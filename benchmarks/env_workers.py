@@ -282,8 +282,8 @@ def trust(scene: Path) -> dict[str, Any]:
 
     from twin.env.trust import Trust
     from twin.geometry.cameras import Viewpoints
+    from twin.geometry.polyline import arc_lengths
     from twin.loading import load_scene
-    from twin.mjcf.world import arc_lengths
     from twin.reality.lighting import LIGHTINGS
     from twin.reality.truth import Truth, align_poses, matched_poses
 
@@ -324,8 +324,8 @@ def trust(scene: Path) -> dict[str, Any]:
 
 
 def _pose(route: np.ndarray, s: float, lateral: float, turn: float) -> np.ndarray:
+    from twin.geometry.polyline import heading_at, point_at
     from twin.geometry.poses import look_at
-    from twin.mjcf.world import heading_at, point_at
 
     heading = float(heading_at(route, s))
     left = np.array([-np.sin(heading), np.cos(heading), 0.0])

@@ -26,9 +26,10 @@ from twin.env.compositor import Compositor
 from twin.env.obstacles import ObstacleModel, add_obstacle_geoms, add_obstacles, place
 from twin.env.physics import camera_pose
 from twin.geometry.cameras import Cameras, opencv_to_mujoco, pixel_grid, unproject
+from twin.geometry.polyline import arc_lengths, heading_at, point_at
 from twin.geometry.poses import Similarity
 from twin.loading import load_scene
-from twin.mjcf.world import World, arc_lengths, heading_at, point_at
+from twin.mjcf.world import World
 from twin.reality import true_world as reality
 from twin.reality.filming import sensor_image
 from twin.reality.sky import apply_haze

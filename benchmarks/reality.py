@@ -22,8 +22,8 @@ from record import record_parser, save
 
 from twin.geometry.cameras import Cameras, pixel_grid, unproject
 from twin.geometry.images import psnr, write_image
+from twin.geometry.polyline import nearest_on_route
 from twin.loading import load_scene
-from twin.mjcf.world import nearest_on_route
 from twin.reality import campus_road, filming, true_world
 from twin.reality.place_sampling import sample_place
 from twin.reality.rasterizer import Rasterizer

@@ -38,11 +38,11 @@ def draw_capture(number: int) -> tuple[Cameras, Array, float]:
     angle = np.clip(s - length / 3, 0.0, rng.uniform(0.1, 1.5) * abs(radius)) / radius
     xy = np.cumsum(np.stack([np.cos(angle), np.sin(angle)], -1) * spacing, 0)
     slope, camber, crown = rng.uniform(-0.08, 0.08), rng.normal(0.0, 0.012), rng.uniform(0.0, 0.02)
-    kerb_at, kerb = rng.uniform(1.2, 4.0), rng.choice([0.0, 0.06, 0.12])
+    curb_at, curb = rng.uniform(1.2, 4.0), rng.choice([0.0, 0.06, 0.12])
     waves = rng.uniform(0.0, 0.012), rng.uniform(3.0, 12.0), rng.uniform(0.0, 6.3)
 
     def ground(along: Array, lateral: Array) -> Array:
-        out = slope * along + camber * lateral - crown * np.abs(lateral) + kerb * (lateral > kerb_at)
+        out = slope * along + camber * lateral - crown * np.abs(lateral) + curb * (lateral > curb_at)
         return out + waves[0] * np.sin(2 * np.pi * along / waves[1] + waves[2])
 
     lift = height + 0.008 * np.sin(2 * np.pi * s / rng.uniform(2.0, 9.0)) + 0.003 * rng.standard_normal(len(s))

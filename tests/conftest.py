@@ -1,5 +1,12 @@
 """Fixtures and options that tests of several files use."""
 
+import os
+
+# Two workers share the cores, and a thread of OpenMP that waits for another keeps its core busy: with two threads each,
+# the tests take a third longer. Processes that the tests start inherit this.
+if "PYTEST_XDIST_WORKER" in os.environ:
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 from pathlib import Path
 
 import numpy as np

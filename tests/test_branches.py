@@ -18,9 +18,10 @@ from twin.env.env_factory import EnvFactory, fingerprint
 from twin.env.physics import HuskyPhysics
 from twin.env.route_segments import scene_tasks
 from twin.errors import InputError
+from twin.geometry.polyline import arc_lengths
 from twin.geometry.route import BRANCH
 from twin.mjcf.scene_xml import run
-from twin.mjcf.world import World, arc_lengths
+from twin.mjcf.world import World
 from twin.report import review_video
 from twin.report.build_sections import mjcf_section, review_section
 from twin.report.review_video import drive_metrics

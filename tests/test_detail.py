@@ -84,11 +84,11 @@ def test_rays_meet_the_ground_where_the_height_map_says_not_where_the_depth_says
     assert not hits_of(sloping_ground(), pose, -np.ones_like(exact))[:, 3].any()
 
 
-def test_rays_meet_a_kerb_at_its_face():
-    """A ray that meets the face of a kerb neither passes it nor stops before it, even if its depth is imprecise."""
+def test_rays_meet_a_curb_at_its_face():
+    """A ray that meets the face of a curb neither passes it nor stops before it, even if its depth is imprecise."""
     cell, low, high = 0.1, 0.0, 0.12
     y = np.tile(np.arange(81) * cell - 4.0, (81, 1))
-    kerb = Detail.without_features(np.where(y < 1.0, low, high).astype(np.float32), np.array([-4.0, -4.0]), cell)
+    curb = Detail.without_features(np.where(y < 1.0, low, high).astype(np.float32), np.array([-4.0, -4.0]), cell)
 
     def height(at):  # what the map's bilinear interpolation gives
         return low + (high - low) * np.clip((at - 0.9) / cell, 0.0, 1.0)
@@ -103,14 +103,14 @@ def test_rays_meet_a_kerb_at_its_face():
     face = (exact > 0) & (np.abs(point[:, 1] - 0.95) < 0.05) & (np.abs(point[:, 0]) < 3.5)
     assert face.sum() > 20
     for factor in (0.97, 1.0, 1.03):
-        hits = hits_of(kerb, pose, factor * exact)
+        hits = hits_of(curb, pose, factor * exact)
         assert (hits[face, 3] > 0).all()
         assert np.abs(hits[face, :2] - 4.0 - point[face, :2]).max() < 0.08
         assert np.abs(hits[face, 2] - height(hits[face, 1] - 4.0)).max() < 0.02
 
 
 class Floor:
-    """Stands for a baked field that shows a level floor at z = 0, smooth where there is a kerb."""
+    """Stands for a baked field that shows a level floor at z = 0, smooth where there is a curb."""
 
     lightings = ("day",)
 

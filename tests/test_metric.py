@@ -232,9 +232,9 @@ def test_the_road_is_found_below_curbs_and_above_mismatches() -> None:
     rng = np.random.default_rng(5)
     film = _path()
     centres = film[:, :3, 3]
-    kerb = centres[rng.integers(0, 60, 200)] + rng.normal(0, 0.8, (200, 3))
-    kerb[:, 2] = 0.35
-    points = np.concatenate([_points(film, rng, on_road=150), kerb])
+    curb = centres[rng.integers(0, 60, 200)] + rng.normal(0, 0.8, (200, 3))
+    curb[:, 2] = 0.35
+    points = np.concatenate([_points(film, rng, on_road=150), curb])
     road = find_road(points, centres, np.array([0.0, 0.0, 1.0]))
     assert road is not None and road.reliable
     assert road.drop == pytest.approx(HEIGHT, abs=0.02)
@@ -539,9 +539,9 @@ def test_a_cross_slope_makes_the_scale_less_certain(tmp_path: Path) -> None:
     film = _path(turn=False)
     points = _points(film, np.random.default_rng(0))
     level = _world(tmp_path / "level", [film], points, _similarity(2)).run(tmp_path / "a", camera_height=HEIGHT)
-    kerb = points.copy()
-    kerb[:300, 2] += 0.06 * (points[:300, 1] > 0.0)
-    raised = _world(tmp_path / "kerb", [film], kerb, _similarity(2)).run(tmp_path / "b", camera_height=HEIGHT)
+    curb = points.copy()
+    curb[:300, 2] += 0.06 * (points[:300, 1] > 0.0)
+    raised = _world(tmp_path / "curb", [film], curb, _similarity(2)).run(tmp_path / "b", camera_height=HEIGHT)
     assert raised["scale_uncertainty_of"]["left_against_right"] > 0.01
     assert level["scale_uncertainty_of"]["left_against_right"] < 0.005
 

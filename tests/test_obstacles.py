@@ -11,8 +11,9 @@ from twin.config_file import load_config
 from twin.env import obstacles as module
 from twin.env.obstacles import add_obstacles, ground_height, obstacle_pose, place, random_distractors, random_obstacles
 from twin.errors import InputError
+from twin.geometry.polyline import arc_lengths, nearest_on_route
 from twin.mjcf.husky import add_husky, set_options
-from twin.mjcf.world import World, arc_lengths, nearest_on_route
+from twin.mjcf.world import World
 
 ANGLE = np.linspace(0, np.pi / 2, 60)
 BEND = np.concatenate(

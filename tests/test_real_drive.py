@@ -23,9 +23,10 @@ from twin.env.task import task_table
 from twin.errors import InputError
 from twin.evaluation.trials import SETUP_COLUMNS, Cell, read_results, read_trials, write_real_trials
 from twin.geometry.images import read_image
+from twin.geometry.polyline import arc_lengths, point_at
 from twin.learn.policy import Control, Policy, load_policy, save_policy
 from twin.learn.policy_network import Architecture
-from twin.mjcf.world import World, arc_lengths, point_at
+from twin.mjcf.world import World
 from twin.reality import REALITY_VERSION, campus_road, real_test, recordings, true_world
 from twin.reality.campus_road import RoadLine
 from twin.reality.lighting import LIGHTINGS, WEATHER, weather, weather_index

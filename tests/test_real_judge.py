@@ -13,8 +13,9 @@ from twin.env.route_segments import RouteSegment
 from twin.env.task import Motion, RewardAndTermination, task_table
 from twin.errors import InputError
 from twin.files import write_json
+from twin.geometry.polyline import arc_lengths, heading_at, point_at
 from twin.geometry.poses import Similarity
-from twin.mjcf.world import World, arc_lengths, heading_at, point_at
+from twin.mjcf.world import World
 from twin.reality.road_task import RealJudge, RoadTask, read_task
 
 PATHS, STEP, SPEED = 1000, 0.2, 1.0

@@ -38,7 +38,7 @@ def test_descriptions_are_within_their_ranges():
             assert piece.curvature == 0.0 or 6.0 <= 1.0 / abs(piece.curvature) <= 40.0, number
             # The verge ends before the center of the bend.
             side, edge = (0, section.left) if piece.curvature > 0.0 else (1, section.right)
-            reach = edge + section.kerb_width + section.sides[side].width
+            reach = edge + section.curb_width + section.sides[side].width
             assert reach * abs(piece.curvature) < 1.0 and section.sides[side].width > 1.0, number
         assert sum(piece.length for piece in spec.line.pieces) > spec.line.length
         assert 0.29 <= film.speed / film.fps <= 2.01 and 0.4 <= film.camera_height <= 1.7, number
@@ -153,7 +153,7 @@ def test_the_ground_mesh_is_the_true_ground(places, number):
     rng = np.random.default_rng(0)
     station, lateral = rng.uniform(0.0, spec.line.length, 3000), rng.uniform(-4.0, 4.0, 3000)
     away = place.route.edges(lateral)
-    keep = (away < -0.1) | ((away > spec.section.kerb_width + 0.1) & (away < spec.section.kerb_width + 1.0))
+    keep = (away < -0.1) | ((away > spec.section.curb_width + 0.1) & (away < spec.section.curb_width + 1.0))
     xy = place.route.at(station, lateral)[keep]
     z = place.route.ground_height(xy)
     origin = np.column_stack([xy, z + 3.0])

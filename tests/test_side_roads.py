@@ -38,6 +38,12 @@ def place(spec):
     return build(spec)
 
 
+@pytest.fixture(scope="module")
+def plain():
+    """The place without its side roads."""
+    return build(sample_place(PLACE))
+
+
 def _lines(number):
     spec = sample_place(number, side_roads=True)
     road = SampledRoad(spec)
@@ -65,7 +71,7 @@ def test_no_other_side_road_crosses_one(numbers, length):
         spec = sample_place(number, length, side_roads=True)
         road, filmed = SampledRoad(spec), [one.mouth for one in spec.line.side_roads]
         for mouth in (one for one in spec.line.mouths if one not in filmed):
-            edge = (spec.section.left if mouth.side > 0 else spec.section.right) + spec.section.kerb_width
+            edge = (spec.section.left if mouth.side > 0 else spec.section.right) + spec.section.curb_width
             across = mouth.station + 0.5 * mouth.width * np.linspace(-1.0, 1.0, 9)
             xy = road.at(across[:, None], mouth.side * (edge + np.arange(0.0, MOUTH_REACH, 0.25)))
             for axis in road.side_axes:
@@ -126,29 +132,28 @@ def test_nothing_stands_on_side_roads_and_things_stand_beside_them(place, spec):
     assert len({obj.name for obj in place.objects}) == len(place.objects)
 
 
-def test_what_stood_beside_the_driven_line_stands_there_still(place, spec):
+def test_what_stood_beside_the_driven_line_stands_there_still(place, plain):
     """Only solids in the way of a filmed side road are missing or moved."""
 
     def centers(one):
         return np.array([solid.center[:2] for obj in one.objects for solid in obj.solids])
 
-    plain, now = centers(build(sample_place(PLACE))), centers(place)
-    kept = np.linalg.norm(plain[:, None] - now, axis=-1).min(1) < 1e-6
-    away = np.min([np.abs(axis.project(plain)[1]) for axis in place.route.side_axes], axis=0)
-    assert kept.mean() > 0.9 and kept[away > 12.0].mean() > 0.98 and len(now) > len(plain)
+    before, now = centers(plain), centers(place)
+    kept = np.linalg.norm(before[:, None] - now, axis=-1).min(1) < 1e-6
+    away = np.min([np.abs(axis.project(before)[1]) for axis in place.route.side_axes], axis=0)
+    assert kept.mean() > 0.9 and kept[away > 12.0].mean() > 0.98 and len(now) > len(before)
 
 
-def test_a_house_has_the_same_windows_with_and_without_side_roads(place):
+def test_a_house_has_the_same_windows_with_and_without_side_roads(place, plain):
     """The real test shows the place without its side roads."""
-    plain, there = (
-        {obj.name: obj.part for obj in one.objects if obj.name.startswith("house_")}
-        for one in (build(sample_place(PLACE)), place)
+    without, there = (
+        {obj.name: obj.part for obj in one.objects if obj.name.startswith("house_")} for one in (plain, place)
     )
-    both = plain.keys() & there.keys()
-    assert len(both) > 20 and len(both) > 0.8 * len(plain)
+    both = without.keys() & there.keys()
+    assert len(both) > 20 and len(both) > 0.8 * len(without)
     for name in both:  # the ground, and so the height, may differ beside a side road
-        assert np.array_equal(plain[name].vertices[:, :2], there[name].vertices[:, :2]), name
-        assert np.array_equal(plain[name].uv, there[name].uv), name
+        assert np.array_equal(without[name].vertices[:, :2], there[name].vertices[:, :2]), name
+        assert np.array_equal(without[name].uv, there[name].uv), name
 
 
 def test_the_ground_mesh_is_the_true_ground(place, spec):
@@ -162,14 +167,14 @@ def test_the_ground_mesh_is_the_true_ground(place, spec):
         one, line = axis.one, SideLine(place.route, axis)
         lateral = rng.uniform(-FREE_HALF_WIDTH, FREE_HALF_WIDTH, 1500)
         driven = line.at(rng.uniform(0.0, line.length, 1500), lateral)
-        edge = 0.5 * one.mouth.width + spec.section.kerb_width
+        edge = 0.5 * one.mouth.width + spec.section.curb_width
         verge = rng.choice([-1.0, 1.0], 1500) * rng.uniform(edge + 0.05, edge + SIDE_VERGE - 0.1, 1500)
         xy = np.concatenate([driven, axis.at(rng.uniform(14.0, one.length - 0.5, 1500), verge)])
         z = place.route.ground_height(xy)
         found = 3.0 - surface.cast(np.column_stack([xy, z + 3.0]), np.tile([0.0, 0.0, -1.0], (len(xy), 1)))
         assert np.quantile(np.abs(found), 0.97) < 0.025 and np.abs(found).max() < 0.2
         low, high = place.route.ground_height(axis.at(25.0, 0.5 * one.mouth.width + np.array([-0.001, 0.001])))
-        assert high - low == pytest.approx(spec.section.kerb_height, abs=0.002)
+        assert high - low == pytest.approx(spec.section.curb_height, abs=0.002)
 
 
 def test_a_long_road_has_textures_for_its_side_roads():

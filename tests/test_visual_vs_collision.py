@@ -9,9 +9,9 @@ from tiny_world import tiny_world
 
 from twin.assets.ground import Ground
 from twin.geometry.cameras import FAR, Cameras, Rendering, intrinsics_for_size, pixel_grid, unproject
+from twin.geometry.polyline import point_at
 from twin.geometry.poses import look_at
 from twin.mjcf.scene_xml import Parts
-from twin.mjcf.world import point_at
 from twin.report.build_report import page
 from twin.report.visual_vs_collision import (
     GeometryViews,

@@ -17,6 +17,7 @@ from twin.env.route_segments import RouteSegment, scene_tasks
 from twin.errors import InputError
 from twin.geometry.cameras import Cameras, depth_determined, project
 from twin.geometry.images import read_image
+from twin.geometry.polyline import arc_lengths, corridor_edges, heading_at, nearest_on_route, point_at, total_turn
 from twin.geometry.route import BRANCH
 from twin.mjcf.scene_xml import (
     add_ground,
@@ -27,7 +28,7 @@ from twin.mjcf.scene_xml import (
     film_camera,
     rest_pose,
 )
-from twin.mjcf.world import World, arc_lengths, corridor_edges, heading_at, nearest_on_route, point_at, total_turn
+from twin.mjcf.world import World
 from twin.report import build_report, figures
 from twin.robot import BASE_HEIGHT, CAMERA_SIZE, HuskyParams
 from twin.scene import SceneDir

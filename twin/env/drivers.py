@@ -24,8 +24,9 @@ from twin.env.controller import CONTROL_PERIOD
 from twin.env.options import check_actions
 from twin.env.physics import HuskyPhysics
 from twin.errors import InputError, short_repr
+from twin.geometry.polyline import arc_lengths, heading_at, nearest_on_route, point_at
 from twin.geometry.poses import wrap_angle
-from twin.mjcf.world import World, arc_lengths, heading_at, nearest_on_route, point_at
+from twin.mjcf.world import World
 from twin.types import Array
 
 if TYPE_CHECKING:  # not imported at run time: `follow_route` works without dm_control

@@ -33,9 +33,10 @@ from twin.env.task import EPISODE_VERSION, DrivePhysics, DriveTask, RewardAndTer
 from twin.env.trust import Trust
 from twin.errors import InputError
 from twin.files import digest_file, digest_json
+from twin.geometry.polyline import point_at
 from twin.loading import Twin, load_scene
 from twin.mjcf.husky import disable_fluid_drag
-from twin.mjcf.world import World, point_at
+from twin.mjcf.world import World
 from twin.nerf.baked import BakedField
 from twin.robot import MAX_LATENCY
 from twin.scene import require_stage, stage_result
@@ -153,7 +154,7 @@ def fingerprint(twin: Twin, task: str, condition: Condition) -> str:
     ]
     return digest_json(
         {
-            "stages": [stage_result(twin.scene, factory) for factory in ("field", "mjcf")],
+            "stages": [stage_result(twin.scene, stage) for stage in ("field", "mjcf")],
             "stretch": _without_route(segment),
             "obstacles": [_without_route(one) for one in config.obstacle if one.route == segment.route],
             "episodes": EPISODE_VERSION,

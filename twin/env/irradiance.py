@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from twin.env.obstacles import PREFIX
 from twin.errors import InputError
 from twin.geometry.cameras import Viewpoints, pixel_grid, unproject
+from twin.geometry.polyline import arc_lengths, heading_at, point_at
 from twin.geometry.poses import look_at
-from twin.mjcf.world import arc_lengths, heading_at, point_at
 from twin.nerf.baked import BakedField
 from twin.nerf.kernels.color_head import harmonics_of
 from twin.nerf.lightings import Probes

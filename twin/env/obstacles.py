@@ -22,9 +22,10 @@ from twin.config import ObstacleConfig
 from twin.config_file import check_obstacles
 from twin.env.route_segments import RouteSegment
 from twin.errors import InputError
+from twin.geometry.polyline import arc_lengths, heading_at, point_at
 from twin.mjcf import husky
 from twin.mjcf.husky_visuals import add_visuals
-from twin.mjcf.world import World, arc_lengths, heading_at, point_at
+from twin.mjcf.world import World
 from twin.types import Array
 
 # ---- geometry

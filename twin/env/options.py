@@ -77,7 +77,8 @@ class Options:
     half_width: float | None = None
     """Half width of the corridor [m]; None: that of the scene."""
     time_limit: float | None = None
-    """Time limit [s]; None: twice the time that the route segment takes at `speed`."""
+    """Time limit [s]; None: twice the time that the route segment takes at `speed`, or 1.5 times that
+    at the robot's top speed if that is longer."""
     start_offset: float = 0.3
     """The start's distance from the route is sampled uniformly within ± this [m]."""
     start_heading: float = 10.0

@@ -13,7 +13,8 @@ import numpy as np
 from twin.config import TaskConfig
 from twin.config_file import MIN_TASK_LENGTH
 from twin.errors import InputError, name_hint
-from twin.mjcf.world import World, heading_at
+from twin.geometry.polyline import heading_at
+from twin.mjcf.world import World
 from twin.types import Array
 
 

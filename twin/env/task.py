@@ -28,8 +28,9 @@ from twin.env.options import STATE_SIZES, Options, check_actions
 from twin.env.physics import EPISODE_STATE, HuskyPhysics
 from twin.env.route_segments import RouteSegment
 from twin.errors import InputError, short_repr
+from twin.geometry.polyline import heading_at, nearest_on_route, point_at
 from twin.geometry.poses import wrap_angle
-from twin.mjcf.world import World, heading_at, nearest_on_route, point_at
+from twin.mjcf.world import World
 from twin.robot import HuskyParams
 from twin.types import Array
 

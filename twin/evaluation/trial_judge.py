@@ -15,8 +15,8 @@ from twin.env.task import Motion, RewardAndTermination
 from twin.errors import InputError
 from twin.geometry.cameras import Rendering, Viewpoints, evenly_spaced, pixel_grid, unproject
 from twin.geometry.images import psnr, to_uint8
+from twin.geometry.polyline import heading_at
 from twin.geometry.poses import wrap_angle
-from twin.mjcf.world import heading_at
 from twin.nerf.sun import relit
 from twin.robot import PixelCamera
 from twin.types import Array, Image

@@ -31,8 +31,9 @@ from twin.assets.gaussians import SH_CONSTANT, Gaussians
 from twin.assets.ground import lattice_faces
 from twin.errors import InputError
 from twin.files import atomic_path
+from twin.geometry.polyline import corridor_edges
 from twin.mjcf.scene_xml import Parts
-from twin.mjcf.world import World, corridor_edges
+from twin.mjcf.world import World
 from twin.robot import WHEELS, HuskyParams
 from twin.types import Array
 

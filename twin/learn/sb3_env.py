@@ -55,7 +55,6 @@ class DriveVecEnv(VecEnv):
         self._reset_seeds()
         self._returns[:], self._lengths[:] = 0.0, 0
         self.vector_env.begin(range(self.num_envs))
-        self.reset_infos = [self.vector_env.info(i) for i in range(self.num_envs)]
         return self._observations()
 
     def _observations(self) -> Any:

@@ -25,6 +25,7 @@ from twin.errors import InputError
 from twin.files import load_arrays
 from twin.geometry.cameras import Cameras, depth_determined, opencv_to_mujoco, project
 from twin.geometry.images import read_image, write_image
+from twin.geometry.polyline import arc_lengths, corridor_edges, heading_at, point_at, total_turn
 from twin.geometry.route import BRANCH
 from twin.mjcf import husky
 from twin.mjcf.world import (
@@ -34,11 +35,6 @@ from twin.mjcf.world import (
     SCENE_XML,
     VISUAL_GROUP,
     World,
-    arc_lengths,
-    corridor_edges,
-    heading_at,
-    point_at,
-    total_turn,
 )
 from twin.robot import BASE_HEIGHT, CAMERA_SIZE, HuskyParams, PixelCamera
 from twin.scene import SceneDir

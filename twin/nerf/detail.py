@@ -131,7 +131,7 @@ def _height_map(
 ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
     """Heights of the ground (along x, along y) [m], and the lowest corner of their grid.
 
-    Rendered depth shows where the ground is, but it smooths kerbs. Stereo depths near the ground replace it where there
+    Rendered depth shows where the ground is, but it smooths curbs. Stereo depths near the ground replace it where there
     are enough of them.
     """
     rendered = _level_points(baked, pixels)
@@ -154,7 +154,7 @@ def _height_map(
     near = known[tuple(node.T)] & (np.abs(points[:, 2] - heights[tuple(node.T)]) < _STEREO_GATE)
     sharp, seen = _medians(points[near], origin, _HEIGHT_CELL, _MIN_STEREO, shape)
     if seen.any():
-        # The smooth heights in a small gap would be a dent in a kerb.
+        # The smooth heights in a small gap would be a dent in a curb.
         gap, nearest = distance_transform_edt(~seen, return_indices=True)
         heights = median_filter(np.where(gap * _HEIGHT_CELL < _MAX_GAP, sharp[tuple(nearest)], heights), 3)
     return np.where(known, heights, kernels.NO_GROUND).astype(np.float32), origin

@@ -36,8 +36,8 @@ from twin.types import Array
 # ---- line
 
 ROAD_HALF_WIDTH = 3.0  # [m] from the center line to the face of the curb
-KERB_HEIGHT = 0.11  # [m] above the adjacent asphalt
-KERB_WIDTH = 0.16  # [m]
+CURB_HEIGHT = 0.11  # [m] above the adjacent asphalt
+CURB_WIDTH = 0.16  # [m]
 VERGE_WIDTH = 5.6  # [m] from the curb to the open land; on the left this includes the sidewalk
 PAVEMENT_WIDTH = 1.7  # [m] of the sidewalk along the left curb
 START, END = -6.0, 88.0  # [m] stations of the ends of the road
@@ -114,7 +114,7 @@ def cross_profile(lateral: ArrayLike) -> Array:
     away = np.abs(np.asarray(lateral, float))
     crown = -_CROWN * (np.sqrt(away**2 + _CROWN_ROUNDING**2) - _CROWN_ROUNDING)
     edge = -_CROWN * (np.hypot(ROAD_HALF_WIDTH, _CROWN_ROUNDING) - _CROWN_ROUNDING)
-    verge = edge + KERB_HEIGHT + VERGE_SLOPE * np.clip(away - ROAD_HALF_WIDTH, 0.0, 8.0)
+    verge = edge + CURB_HEIGHT + VERGE_SLOPE * np.clip(away - ROAD_HALF_WIDTH, 0.0, 8.0)
     return np.where(away <= ROAD_HALF_WIDTH, crown, verge)
 
 
@@ -151,7 +151,7 @@ WALLS = {  # building → brick or plaster, color
     "sheds": ("bricks", (0.42, 0.38, 0.34)),
 }
 
-WET_TEXTURES = ("road", "kerb", "verge_left", "verge_right", "land")
+WET_TEXTURES = ("road", "curb", "verge_left", "verge_right", "land")
 """Ground textures that rain darkens."""
 
 
@@ -170,7 +170,7 @@ def campus_textures() -> dict[str, NDArray[np.uint8]]:
     paved = round(PAVEMENT_WIDTH / _VERGE_PIXEL)
     left[-paved:] = textures.slabs(rng(3), (paved, shape[1]), _VERGE_PIXEL, (0.57, 0.75))
     out["verge_left"] = to_uint8(left)
-    out["kerb"] = to_uint8(textures.slabs(rng(4), (16, round(length / 0.02)), 0.02, (10.0, 0.9)) * np.float32(0.95))
+    out["curb"] = to_uint8(textures.slabs(rng(4), (16, round(length / 0.02)), 0.02, (10.0, 0.9)) * np.float32(0.95))
     out["land"] = to_uint8(textures.grass(rng(5), (2292, 2172), 1 / 12))
     for k, (name, (kind, color)) in enumerate(WALLS.items()):
         (_, size, _) = BUILDINGS[name]
@@ -293,7 +293,7 @@ LAND_RANGE = (-60.0, 120.0, -130.0, 60.0)  # [m] x and y range of the land beyon
 LAND_STEP = 1.5  # [m] between vertices of the land
 
 
-_OUTER = ROAD_HALF_WIDTH + KERB_WIDTH
+_OUTER = ROAD_HALF_WIDTH + CURB_WIDTH
 _LAYOUT = GroundLayout(
     bands={
         "road": (START, END, ROAD_HALF_WIDTH, -ROAD_HALF_WIDTH),
@@ -344,15 +344,15 @@ def _add_ground(place: KnownPlace) -> None:
     crossing = np.linspace(edge, -edge, 13)
     place.objects.append(PlaceObject("road", "ground", _road_strip(route, list(crossing), None), "road"))
     low = float(cross_profile(edge))
-    outer = edge + KERB_WIDTH
+    outer = edge + CURB_WIDTH
     high = float(cross_profile(outer))
     for side, name in ((1.0, "left"), (-1.0, "right")):
         profile = [(edge, low - 0.02), (edge + 0.015, high - 0.012), (edge + 0.03, high), (outer, high)]
         verge = np.linspace(outer, outer + VERGE_WIDTH, 8)
         if side > 0:
             profile, verge = profile[::-1], verge[::-1]
-        kerb = _road_strip(route, [side * p[0] for p in profile], [p[1] for p in profile])
-        place.objects.append(PlaceObject(f"kerb_{name}", "ground", kerb, "kerb"))
+        curb = _road_strip(route, [side * p[0] for p in profile], [p[1] for p in profile])
+        place.objects.append(PlaceObject(f"curb_{name}", "ground", curb, "curb"))
         strip = _road_strip(route, [side * v for v in verge], None)
         place.objects.append(PlaceObject(f"verge_{name}", "ground", strip, f"verge_{name}"))
     x0, x1, y0, y1 = LAND_RANGE

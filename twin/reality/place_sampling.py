@@ -124,7 +124,7 @@ def _section(rng: np.random.Generator, setting: str) -> SectionSpec:
     # The line runs in the right-hand lane, or in the middle of the road.
     lane = width >= 5.0 and rng.random() < 0.5
     right = 0.5 * width if not lane else max(1.5, 0.28 * width)
-    kerbed = rng.random() < {"town": 0.95, "suburb": 0.8, "village": 0.45, "works": 0.6, "park": 0.3}.get(setting, 0.0)
+    curbed = rng.random() < {"town": 0.95, "suburb": 0.8, "village": 0.45, "works": 0.6, "park": 0.3}.get(setting, 0.0)
     paved = {"town": 0.95, "suburb": 0.7, "village": 0.4, "works": 0.35, "park": 0.15}.get(setting, 0.0)
     verges = {
         "town": {"grass": 1.0, "gravel": 1.0, "earth": 0.7},
@@ -144,9 +144,9 @@ def _section(rng: np.random.Generator, setting: str) -> SectionSpec:
     fall = float(rng.uniform(0.005, 0.04))
     if shape == "camber" and rng.random() < 0.5:
         fall = -fall
-    kerb_height, kerb_width = float(rng.uniform(0.03, 0.15)), float(rng.uniform(0.10, 0.30))
+    curb_height, curb_width = float(rng.uniform(0.03, 0.15)), float(rng.uniform(0.10, 0.30))
     return SectionSpec(
-        width - right, right, shape, fall, kerb_height * kerbed, kerb_width * kerbed, (sides[0], sides[1])
+        width - right, right, shape, fall, curb_height * curbed, curb_width * curbed, (sides[0], sides[1])
     )
 
 
@@ -155,7 +155,7 @@ def _fitted(section: SectionSpec, line: LineSpec) -> SectionSpec:
     sides = []
     for side, edge, sign in zip(section.sides, (section.left, section.right), (1.0, -1.0), strict=True):
         tight = [1.0 / abs(piece.curvature) for piece in line.pieces if sign * piece.curvature > 0.0]
-        width = min(side.width, min(tight, default=np.inf) - edge - section.kerb_width - 0.35)
+        width = min(side.width, min(tight, default=np.inf) - edge - section.curb_width - 0.35)
         sides.append(replace(side, pavement=min(side.pavement, 0.75 * width), width=width))
     return replace(section, sides=(sides[0], sides[1]))
 
@@ -189,7 +189,7 @@ def _surface(rng: np.random.Generator, paint: np.random.Generator, setting: str,
     covers = float(rng.uniform(9.0, 30.0)) * (rng.random() < 0.8)
     litter = float(rng.uniform(0.5, 14.0)) * (2.0 if setting in ("forest", "park") else 1.0)
     strip = float(rng.uniform(0.5, 0.9)) * (rng.random() < 0.6)
-    drained = section.kerb_height > 0.0
+    drained = section.curb_height > 0.0
     markings: list[str] = []
     marked = {"town": 0.75, "suburb": 0.45, "village": 0.35, "works": 0.6, "field": 0.35, "forest": 0.25}
     if kind in ("asphalt", "concrete") and paint.random() < marked.get(setting, 0.2):
@@ -296,9 +296,9 @@ def _boundaries(rng: np.random.Generator, setting: str, section: SectionSpec) ->
         zinc = _hsv(rng, (0.25, 0.6), (0.0, 0.35), (0.25, 0.6))
         color = {"wall": stone, "mesh": zinc, "bollards": zinc}.get(kind, wood)
         beyond = float(rng.uniform(0.1, 1.6))
-        distance = section.kerb_width + side.pavement + beyond
+        distance = section.curb_width + side.pavement + beyond
         if kind == "bollards":
-            distance = section.kerb_width + 0.35
+            distance = section.curb_width + 0.35
         out.append(BoundarySpec(kind, height, color, float(rng.uniform(0.45, 0.95)), distance))
     return out[0], out[1]
 

@@ -116,9 +116,9 @@ class SectionSpec:
     """`crown`: falls from the middle to both edges; `camber`: falls from the left edge to the right."""
     crossfall: float
     """Slope across the road; negative for a camber that falls to the left."""
-    kerb_height: float
+    curb_height: float
     """[m]; 0 for none."""
-    kerb_width: float
+    curb_width: float
     """[m]"""
     sides: tuple[Side, Side]
     """Left, right."""
@@ -132,9 +132,9 @@ class SectionSpec:
         """Distance of the road's edge from the driven line on a side (1 = left, −1 = right) [m]."""
         return self.left if side > 0 else self.right
 
-    def kerb_edge(self, side: int) -> float:
+    def curb_edge(self, side: int) -> float:
         """Distance of the curb's outer edge from the driven line on a side [m]."""
-        return self.edge(side) + self.kerb_width
+        return self.edge(side) + self.curb_width
 
     def beside(self, side: int) -> Side:
         """The ground on a side."""
@@ -142,7 +142,7 @@ class SectionSpec:
 
     def verge_edge(self, side: int) -> float:
         """Distance of the verge's outer edge from the driven line on a side [m]."""
-        return self.kerb_edge(side) + self.beside(side).width
+        return self.curb_edge(side) + self.beside(side).width
 
 
 @dataclass(frozen=True)

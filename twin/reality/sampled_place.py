@@ -51,8 +51,8 @@ def build(spec: PlaceSpec, displaced: bool = False) -> KnownPlace:
     section = spec.section
     across = {
         "road": (section.left, -section.right),
-        "verge_left": (section.verge_edge(1), section.kerb_edge(1)),
-        "verge_right": (-section.kerb_edge(-1), -section.verge_edge(-1)),
+        "verge_left": (section.verge_edge(1), section.curb_edge(1)),
+        "verge_right": (-section.curb_edge(-1), -section.verge_edge(-1)),
     }
     names_of_parts = [f"_{k}" if k else "" for k in range(parts)]
     lands = land_boxes(np.concatenate([road.at(stations), *beside]), tiled=parts > 1)
@@ -65,10 +65,10 @@ def build(spec: PlaceSpec, displaced: bool = False) -> KnownPlace:
         lands=lands,
         field=((corners[0][0], corners[0][1]), (corners[1][0], corners[1][1])),
         wet=(
-            *(f"{name}{part}" for part in names_of_parts for name in ("road", "kerb", "verge_left", "verge_right")),
+            *(f"{name}{part}" for part in names_of_parts for name in ("road", "curb", "verge_left", "verge_right")),
             *lands,
             "side_road",
-            *(f"{one.name}{end}" for one in spec.line.side_roads for end in ("", "_mouth", "_kerb", "_verge")),
+            *(f"{one.name}{end}" for one in spec.line.side_roads for end in ("", "_mouth", "_curb", "_verge")),
         ),
     )
     names: dict[str, tuple[House, str, Rgb, Rgb]] = {}
@@ -162,7 +162,7 @@ class Site:
         axes = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
         xy = center + np.stack([a.ravel(), b.ravel()], -1) @ axes
         station, lateral = road.project(xy)
-        free = (road.edges(lateral) > section.kerb_width + clear) & (np.abs(lateral) > FREE_HALF_WIDTH + CLEARANCE)
+        free = (road.edges(lateral) > section.curb_width + clear) & (np.abs(lateral) > FREE_HALF_WIDTH + CLEARANCE)
         for mouth in road.line.mouths:
             free &= (np.abs(station - mouth.station) > mouth.width / 2 + 0.4) | (lateral * mouth.side < 0.0)
         for line, axis in zip(self._side_lines, road.side_axes, strict=True):
@@ -237,7 +237,7 @@ def _of_driven_line(spec: PlaceSpec) -> _Roadside:
     return _Roadside(
         spec,
         *(-6.0, length + 22.0, (-7.0, length + 20.0)),
-        (section.kerb_edge(1), section.kerb_edge(-1)),
+        (section.curb_edge(1), section.curb_edge(-1)),
         (section.sides[0].width, section.sides[1].width),
         (section.sides[0].pavement, section.sides[1].pavement),
     )

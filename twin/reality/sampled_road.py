@@ -154,8 +154,8 @@ class SampledRoad:
         out = self._surface(np.clip(lateral, -section.right, section.left))
         for sign in (1, -1):
             away, side = sign * lateral - section.edge(sign), section.beside(sign)
-            kerb = section.kerb_height * (1.0 - self.mouth_weight(station, sign))
-            out = out + np.where(away > 0.0, kerb + side.slope * np.clip(away, 0.0, side.width), 0.0)
+            curb = section.curb_height * (1.0 - self.mouth_weight(station, sign))
+            out = out + np.where(away > 0.0, curb + side.slope * np.clip(away, 0.0, side.width), 0.0)
         return out
 
     def profile(self, station: ArrayLike) -> Array:
@@ -198,7 +198,7 @@ class SampledRoad:
         section = self.section
         z = self.profile(np.clip(station, self.start - 5.0, self.end + 5.0)) + self.cross_profile(station, lateral)
         width = np.where(lateral > 0.0, section.sides[0].width, section.sides[1].width)
-        share = np.clip((self.edges(lateral) - section.kerb_width - 0.25 * width) / (0.75 * width), 0.0, 1.0)
+        share = np.clip((self.edges(lateral) - section.curb_width - 0.25 * width) / (0.75 * width), 0.0, 1.0)
         # Distance past the road's ends [m], minus 5 m.
         beyond = np.maximum(self.start - 5.0 - station, station - self.end - 5.0)
         share = np.maximum(share, np.clip(beyond / 5.0, 0.0, 1.0))
@@ -267,14 +267,14 @@ def add_road(place: KnownPlace, road: SampledRoad, stations: Array, suffix: str)
     inner = 1e-6  # keeps the vertices at the road's edges on the road
     strip("road", "road", np.linspace(section.left - inner, -section.right + inner, 15))
     for sign, name in ((1, "left"), (-1, "right")):
-        edge, outer = section.edge(sign), section.kerb_edge(sign)
-        if section.kerb_height > 0.0:
+        edge, outer = section.edge(sign), section.curb_edge(sign)
+        if section.curb_height > 0.0:
             low = road.cross_profile(stations, sign * edge)
             high = road.cross_profile(stations, sign * (edge + 0.03))
             profile = np.array([edge, edge + 0.015, edge + 0.03, outer])
             back = road.cross_profile(stations, sign * (outer + inner))
             lifts = np.stack([low - 0.02, high - 0.15 * (high - low), high, back])
-            strip(f"kerb_{name}", "kerb", sign * profile[::-sign], lifts[::-sign])
+            strip(f"curb_{name}", "curb", sign * profile[::-sign], lifts[::-sign])
         across = sign * np.linspace(outer + inner, outer + section.beside(sign).width, 9)
         strip(f"verge_{name}", f"verge_{name}", np.sort(across)[::-1], gaps=sign)
 
@@ -286,7 +286,7 @@ def add_side_roads(place: KnownPlace, road: SampledRoad, stations: Array) -> Non
     for k, mouth in enumerate(road.line.mouths):
         if mouth in filmed:
             continue
-        reach = section.kerb_edge(mouth.side) + np.arange(0.0, MOUTH_REACH, 0.5)
+        reach = section.curb_edge(mouth.side) + np.arange(0.0, MOUTH_REACH, 0.5)
         first = stations[np.argmax(stations + STEP / 2 > mouth.station - mouth.width / 2)]
         inside = stations[(stations >= first - STEP) & (stations <= mouth.station + mouth.width / 2 + STEP)]
         xy = road.at(inside[None], mouth.side * reach[:, None])
@@ -304,7 +304,7 @@ def add_land(place: KnownPlace, road: SampledRoad, name: str, box: tuple[float, 
     x, y = np.meshgrid(np.arange(x0, x1 + 0.1, _LAND_STEP), np.arange(y1, y0 - 0.1, -_LAND_STEP))
     xy = np.stack([x, y], -1)
     station, lateral = road.project(xy)
-    away = road.edges(lateral) - section.kerb_width
+    away = road.edges(lateral) - section.curb_width
     width = np.where(lateral > 0.0, section.sides[0].width, section.sides[1].width)
     along = (station > road.start - 2.0) & (station < road.end + 2.0)
     sunk = np.where(along & (away < width - 1.6), 0.5, np.where(along & (away < width + 1.6), 0.12, 0.0))
@@ -373,7 +373,7 @@ def _pieces(rng: np.random.Generator, setting: str, section: SectionSpec, length
         if straight:
             piece = Piece(float(rng.uniform(6.0, 34.0)), 0.0)
         else:
-            least = max(6.0, section.kerb_edge(1 if left else -1) + 2.2)
+            least = max(6.0, section.curb_edge(1 if left else -1) + 2.2)
             radius = float(np.exp(rng.uniform(np.log(least), np.log(40.0))))
             angle = np.deg2rad(rng.uniform(20.0, 100.0)) * bendy
             piece = Piece(min(radius * float(angle), 45.0), (1.0 if left else -1.0) / radius)
@@ -444,7 +444,7 @@ def _further(
                 left = off < 0.0
                 angle = min(angle, _HEADING_BOUND + abs(off))
             side = 1 if left else -1
-            least = max(6.0, section.kerb_edge(side) + 2.2, section.verge_edge(side) + _BEND_ROOM)
+            least = max(6.0, section.curb_edge(side) + 2.2, section.verge_edge(side) + _BEND_ROOM)
             radius = float(np.exp(rng.uniform(np.log(least), np.log(40.0))))
             angle = min(angle, 45.0 / radius)
             out.append(Piece(radius * angle, (1.0 if left else -1.0) / radius))

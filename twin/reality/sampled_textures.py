@@ -86,7 +86,7 @@ def road(
             station += rng.uniform(-0.3, 0.3) * surface.covers
             center = (int(np.clip(station, 1.0, length - 1.0) / pixel), int(rng.uniform(0.25, 0.75) * rows))
             manhole(image, center, int(rng.uniform(0.22, 0.36) / pixel))
-            if section.kerb_height > 0.0:
+            if section.curb_height > 0.0:
                 gully(image, int(np.clip(station + 4.0, 1.0, length - 1.0) / pixel), rng.random() < 0.5, pixel)
     fallen = np.array([[0.55, 0.42, 0.16], [0.42, 0.28, 0.12], [0.38, 0.42, 0.18], [0.45, 0.44, 0.42]], np.float32)
     fallen = fallen[style.permutation(4)[: int(style.integers(1, 4))]] * style.uniform(0.5, 1.1, 3).astype(np.float32)
@@ -407,17 +407,17 @@ def _paint_side_road(spec: PlaceSpec, k: int, one: SideRoad) -> dict[str, NDArra
         return stream(spec.number, "side_roads", k, 10, key)
 
     begin = section.verge_edge(one.mouth.side)
-    half, before, length = 0.5 * one.mouth.width, begin - section.kerb_edge(one.mouth.side), one.length - begin
+    half, before, length = 0.5 * one.mouth.width, begin - section.curb_edge(one.mouth.side), one.length - begin
     across = replace(section, left=half, right=half)
     out = {
         one.name: road(rng(0), surface, across, length, _ROAD_PIXEL),
-        f"{one.name}_mouth": road(rng(1), surface, replace(across, kerb_height=0.0), before, _ROAD_PIXEL),
+        f"{one.name}_mouth": road(rng(1), surface, replace(across, curb_height=0.0), before, _ROAD_PIXEL),
     }
     shape = round(SIDE_VERGE / _VERGE_PIXEL), round(length / _VERGE_PIXEL)
     out[f"{one.name}_verge"] = turf(rng(2), surface, shape, _VERGE_PIXEL, section.sides[0].verge)
-    if section.kerb_height > 0.0:
+    if section.curb_height > 0.0:
         tone, unit = rng(3).uniform(0.7, 1.25), float(rng(4).uniform(0.5, 1.2))
-        out[f"{one.name}_kerb"] = slabs(rng(5), (16, round(length / 0.02)), 0.02, (10.0, unit)) * tone
+        out[f"{one.name}_curb"] = slabs(rng(5), (16, round(length / 0.02)), 0.02, (10.0, unit)) * tone
     return {name: to_uint8(image) for name, image in out.items()}
 
 
@@ -453,15 +453,15 @@ def _paint(
                 inner = slice(shape[0] - paved[0], None) if k == 0 else slice(0, paved[0])
                 image[inner] = paving(rng(4, k, *more), surface, paved, _VERGE_PIXEL, side.paving, style(2 + k))
             out[f"{name}{part}"] = to_uint8(image)
-        if section.kerb_height > 0.0:
+        if section.curb_height > 0.0:
             tone = float(rng(5).uniform(0.7, 1.25))
             stones = (16, round(length / 0.02))
-            kerb = slabs(rng(6, *more), stones, 0.02, (10.0, float(rng(5).uniform(0.5, 1.2)))) * tone
-            out[f"kerb{part}"] = to_uint8(kerb)
+            curb = slabs(rng(6, *more), stones, 0.02, (10.0, float(rng(5).uniform(0.5, 1.2)))) * tone
+            out[f"curb{part}"] = to_uint8(curb)
     if spec.line.mouths:
         plain = replace(surface, markings=(), strip=0.0)
         half = 0.5 * max(mouth.width for mouth in spec.line.mouths)
-        across = replace(section, left=half, right=half, kerb_height=0.0)
+        across = replace(section, left=half, right=half, curb_height=0.0)
         out["side_road"] = to_uint8(road(rng(7), plain, across, MOUTH_REACH / 0.25, 0.02))
     for k, one in enumerate(spec.line.side_roads):
         out |= _paint_side_road(spec, k, one)

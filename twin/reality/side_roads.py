@@ -44,9 +44,9 @@ class SideAxis:
         """`section` is that of the driven road."""
         self._road, self.section, self.one = road, section, one
         self.length = one.length
-        self.edge = 0.5 * one.mouth.width + section.kerb_width
+        self.edge = 0.5 * one.mouth.width + section.curb_width
         """Distance of the curbs' outer edges from the axis [m]."""
-        self.surface_start = section.kerb_edge(one.mouth.side)
+        self.surface_start = section.curb_edge(one.mouth.side)
         """Station where the surface begins [m]: at the curb of the driven road."""
         self.verge_start = section.verge_edge(one.mouth.side)
         """Station where the verge of the driven road ends [m]; there, the side road's verges begin."""
@@ -74,7 +74,7 @@ class SideAxis:
         away = np.abs(lateral)
         along = smooth((station - self.verge_start) / _RISE) * (1.0 - smooth((station - self.length) / _RISE))
         across = (away > 0.5 * self.one.mouth.width) * (1.0 - smooth((away - (self.edge + SIDE_VERGE)) / _RISE))
-        return self.section.kerb_height * along * across
+        return self.section.curb_height * along * across
 
     def occupied(self, xy: Array, margin: float) -> NDArray[np.bool_]:
         """True at points (..., 2) on the side road, its curbs, or up to a margin [m] beside them."""
@@ -157,7 +157,7 @@ def with_side_roads(line: LineSpec, section: SectionSpec, road: DrivenLine, star
     others = road.at(np.arange(start, end, 1.0))
     short = {}  # points (n, 2) [m] on the side roads that are not filmed
     for mouth in line.mouths:
-        reach = section.kerb_edge(mouth.side) + np.arange(0.0, MOUTH_REACH, 0.5)
+        reach = section.curb_edge(mouth.side) + np.arange(0.0, MOUTH_REACH, 0.5)
         short[mouth] = road.at(np.full_like(reach, mouth.station), mouth.side * reach)
     found: list[tuple[Mouth, SideRoad]] = []
     taken: list[Array] = []
@@ -166,20 +166,20 @@ def with_side_roads(line: LineSpec, section: SectionSpec, road: DrivenLine, star
         radius = min(0.5 * wide.width, section.edge(mouth.side)) + _SWING
         if mouth.station - radius - LEAD < 0.0:
             continue
-        kerb = section.kerb_edge(mouth.side)
-        whole = SideRoad(f"side_{len(found) + 1}", wide, radius, 0.0, kerb + _DRIVEN + _BEYOND)
-        out = np.arange(kerb, whole.length + 0.1, 0.5)
+        curb = section.curb_edge(mouth.side)
+        whole = SideRoad(f"side_{len(found) + 1}", wide, radius, 0.0, curb + _DRIVEN + _BEYOND)
+        out = np.arange(curb, whole.length + 0.1, 0.5)
         axis = SideAxis(road, section, whole).at(out)
         free = np.linalg.norm(axis[:, None] - others, axis=-1).min(1) > np.minimum(_NEAR_MOUTH * out, _ROOM)
-        half = 0.5 * wide.width + section.kerb_width + SIDE_VERGE
+        half = 0.5 * wide.width + section.curb_width + SIDE_VERGE
         for other, points in short.items():
             if other != mouth:
                 free &= np.linalg.norm(axis[:, None] - points, axis=-1).min(1) > half + 0.5 * other.width
         for one in taken:
             free &= np.linalg.norm(axis[:, None] - one, axis=-1).min(1) > _APART
         length = float(out[-1] if free.all() else out[max(int(np.argmin(free)) - 1, 0)])
-        driven = min(kerb + _DRIVEN, length - _SPARED)
-        if driven >= kerb + _MIN_DRIVEN:
+        driven = min(curb + _DRIVEN, length - _SPARED)
+        if driven >= curb + _MIN_DRIVEN:
             found.append((mouth, replace(whole, driven=round(driven, 2), length=round(length, 2))))
             taken.append(axis[out <= length])
     wider = {mouth: one.mouth for mouth, one in found}
@@ -194,9 +194,9 @@ def with_side_roads(line: LineSpec, section: SectionSpec, road: DrivenLine, star
 
 
 def add_side_road(place: KnownPlace, axis: SideAxis) -> None:
-    """Adds surface, curbs and verges of a side road; their textures are `<name>`, `<name>_kerb`, `<name>_verge`."""
+    """Adds surface, curbs and verges of a side road; their textures are `<name>`, `<name>_curb`, `<name>_verge`."""
     one, section = axis.one, axis.section
-    half, kerb = 0.5 * one.mouth.width, section.kerb_width
+    half, curb = 0.5 * one.mouth.width, section.curb_width
 
     def strip(name: str, texture: str, first: float, laterals: Array, last: float, lift: float = 0.0) -> None:
         """Adds a strip of the ground between two stations, with vertices at `laterals` [m], left first."""
@@ -212,12 +212,12 @@ def add_side_road(place: KnownPlace, axis: SideAxis) -> None:
     strip(f"{one.name}_mouth", f"{one.name}_mouth", axis.surface_start, _across(half + _STEP), begin, _LIFT)
     strip(one.name, one.name, begin, _across(half - inner), one.length, _LIFT)
     for sign, side in ((1, "left"), (-1, "right")):
-        outer = sign * np.linspace(half + kerb + inner, half + kerb + SIDE_VERGE, 5)
+        outer = sign * np.linspace(half + curb + inner, half + curb + SIDE_VERGE, 5)
         strip(f"{one.name}_verge_{side}", f"{one.name}_verge", begin, np.sort(outer)[::-1], one.length)
-        if section.kerb_height <= 0.0:
+        if section.curb_height <= 0.0:
             continue
         stations = np.linspace(begin, one.length, round((one.length - begin) / _STEP) + 1)
-        profile = np.array([half - inner, half + 0.015, half + 0.03, half + kerb])
+        profile = np.array([half - inner, half + 0.015, half + 0.03, half + curb])
         xy = axis.at(stations[None], sign * profile[:, None])
         z = axis.ground_height(xy)
         z[1] = z[2] - 0.15 * (z[2] - z[0])
@@ -225,7 +225,7 @@ def add_side_road(place: KnownPlace, axis: SideAxis) -> None:
         part = primitives.grid(
             xy[::-sign], z[::-sign], primitives.share(stations)[None], primitives.share(profile)[::-sign, None]
         )
-        place.objects.append(PlaceObject(f"{one.name}_kerb_{side}", "ground", part, f"{one.name}_kerb"))
+        place.objects.append(PlaceObject(f"{one.name}_curb_{side}", "ground", part, f"{one.name}_curb"))
 
 
 def _across(half: float) -> Array:

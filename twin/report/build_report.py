@@ -16,9 +16,10 @@ from twin.errors import join_names
 from twin.files import read_json, wrap_read_errors, write_text
 from twin.geometry.cameras import Cameras, SparsePoints
 from twin.geometry.passes import find_passes
+from twin.geometry.polyline import arc_lengths
 from twin.geometry.route import BRANCH
 from twin.mjcf.scene_xml import Parts
-from twin.mjcf.world import SCENE_XML, World, arc_lengths
+from twin.mjcf.world import SCENE_XML, World
 from twin.report import figures
 from twin.report.build_sections import SECTIONS
 from twin.report.html import (

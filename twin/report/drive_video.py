@@ -17,7 +17,8 @@ from twin.env.mujoco_renderer import SceneCamera, chase_poses
 from twin.env.obstacles import obstacle_pose
 from twin.errors import join_names
 from twin.evaluation.trial_judge import JudgedTrial, TrialViews
-from twin.mjcf.world import World, point_at
+from twin.geometry.polyline import point_at
+from twin.mjcf.world import World
 from twin.report.video_layout import (
     ACCENT,
     AMBER,

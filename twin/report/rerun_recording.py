@@ -24,7 +24,8 @@ from scipy.spatial.transform import Rotation
 from twin.env.episode import Episode
 from twin.env.obstacles import obstacle_pose
 from twin.errors import InputError
-from twin.mjcf.world import World, corridor_edges
+from twin.geometry.polyline import corridor_edges
+from twin.mjcf.world import World
 from twin.types import Array
 
 if TYPE_CHECKING:

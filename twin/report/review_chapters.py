@@ -22,7 +22,8 @@ from twin.errors import join_names
 from twin.files import write_bytes
 from twin.geometry.cameras import Cameras, RenderableField, Rendering, Viewpoints, evenly_spaced, nearest_frame
 from twin.geometry.images import psnr, read_image, resize, to_uint8
-from twin.mjcf.world import World, arc_lengths
+from twin.geometry.polyline import arc_lengths
+from twin.mjcf.world import World
 from twin.report.video_layout import (
     ACCENT,
     AMBER,

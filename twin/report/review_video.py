@@ -25,9 +25,10 @@ from twin.env.trust import Trust
 from twin.errors import InputError
 from twin.files import write_json
 from twin.geometry.cameras import Cameras, RenderableField, Viewpoints, evenly_spaced
+from twin.geometry.polyline import arc_lengths, heading_at, point_at
 from twin.geometry.poses import look_at
 from twin.mjcf.scene_xml import Parts
-from twin.mjcf.world import World, arc_lengths, heading_at, point_at
+from twin.mjcf.world import World
 from twin.nerf.baked import BakedField
 from twin.report.html import follower_verdict
 from twin.report.review_chapters import (

@@ -19,7 +19,8 @@ from twin.evaluation.statistics import MIN_POLICIES, MIN_TRIALS
 from twin.evaluation.training_curves import TestCount, plot_tests, range_text
 from twin.evaluation.trials import Trial, csv_text
 from twin.files import write_text
-from twin.mjcf.world import World, point_at
+from twin.geometry.polyline import point_at
+from twin.mjcf.world import World
 from twin.report.figures import (
     FULL_WIDTH,
     INK,

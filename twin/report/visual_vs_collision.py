@@ -34,8 +34,9 @@ from twin.geometry.cameras import (
     pixel_grid,
     unproject,
 )
+from twin.geometry.polyline import arc_lengths, point_at
 from twin.mjcf.scene_xml import Parts
-from twin.mjcf.world import CAMERA_SIZE, World, arc_lengths, point_at
+from twin.mjcf.world import CAMERA_SIZE, World
 from twin.report.html import Section, Verdict, as_number, cautions_above, facts_of, pick
 from twin.report.video_layout import (
     PANEL_BACKGROUND,

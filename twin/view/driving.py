@@ -26,8 +26,9 @@ from twin.env.route_segments import RouteSegment, find_task
 from twin.env.task import DrivePhysics, DriveTask, control
 from twin.errors import InputError
 from twin.files import toml_value
+from twin.geometry.polyline import arc_lengths, heading_at, point_at
 from twin.loading import Twin
-from twin.mjcf.world import World, arc_lengths, heading_at, point_at
+from twin.mjcf.world import World
 from twin.nerf.baked import BakedField
 from twin.types import Array, Image
 from twin.view.scene_picture import ObjectState

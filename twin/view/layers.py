@@ -9,8 +9,9 @@ import viser
 
 from twin.files import load_arrays
 from twin.geometry.cameras import Cameras, unproject
+from twin.geometry.polyline import corridor_edges, heading_at, point_at
 from twin.loading import Twin
-from twin.mjcf.world import World, corridor_edges, heading_at, point_at
+from twin.mjcf.world import World
 from twin.nerf.baked import BakedField
 from twin.scene import require_stage
 from twin.types import Array

@@ -104,7 +104,7 @@ def surface_hit(grid: DetailGrid, o: wp.vec3f, ray: wp.vec3f, depth: wp.float32,
     """The hit of a ray from `o` that meets a surface at the z-depth `depth` [m].
 
     `ray` is the ray's direction with unit z-depth, and `per_pixel` the width of a pixel per meter of depth. Two steps
-    of a fixed-point iteration find level ground. At a kerb, they end on its two sides, and bisection finds it between.
+    of a fixed-point iteration find level ground. At a curb, they end on its two sides, and bisection finds it between.
     """
     x0 = o[0] - grid.origin[0]
     y0 = o[1] - grid.origin[1]
