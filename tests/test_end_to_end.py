@@ -18,6 +18,8 @@ from twin import commands
 from twin.reality.__main__ import TINY, film
 from twin.scene import STAGE_FOLDERS
 
+pytestmark = pytest.mark.slow  # all share one build of minutes
+
 QUICK = (
     "nerf.steps=120",
     "nerf.rays=1024",
@@ -118,7 +120,6 @@ def test_the_twin_opens_with_its_field_world_and_cameras(built):
         twin.load_scene(root / "input")
 
 
-@pytest.mark.slow
 def test_the_benchmark_of_the_field_runs(built, tmp_path):
     root, _ = built
     script, file = Path(__file__).parents[1] / "benchmarks/field.py", tmp_path / "figures.json"
@@ -135,7 +136,6 @@ def test_the_benchmark_of_the_field_runs(built, tmp_path):
     assert all(name in done.stdout for name in figures if name != "about")
 
 
-@pytest.mark.slow
 def test_it_is_driven_by_what_it_sees(built, tmp_path):
     """In the environment of a real build, pictures show the field, the goal is reached, and a film is written."""
     from twin.env.drivers import RouteDriver
@@ -156,7 +156,6 @@ def test_it_is_driven_by_what_it_sees(built, tmp_path):
     assert done.returncode == 0 and "goal after" in done.stdout and film.stat().st_size > 1e4, done.stderr[-3000:]
 
 
-@pytest.mark.slow
 def test_the_benchmark_of_the_environment_runs(built, tmp_path):
     root, _ = built
     script, file = Path(__file__).parents[1] / "benchmarks/env.py", tmp_path / "figures.json"
