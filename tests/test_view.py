@@ -329,6 +329,12 @@ def test_wrong_options_are_one_line(root, tmp_path, monkeypatch, capsys, given, 
     assert told.startswith("error: ") and said in told and told.count("\n") == 1
 
 
+def test_a_misspelt_lighting_is_told_before_the_address(root, capsys):
+    assert main(["view", str(root), "--port", "0", "--lighting", "nigth"]) == 2
+    told = capsys.readouterr()
+    assert told.out == "" and "'nigth': unknown; did you mean 'night'?" in told.err
+
+
 # ---- pictures
 
 

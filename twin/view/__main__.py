@@ -118,7 +118,8 @@ def open_page(
 ) -> "Page":
     """Opens the page of a built scene, without the robot.
 
-    `announce` is called with the page's address as soon as a browser can open it, before the field is loaded.
+    `announce` is called with the page's address as soon as a browser can open it, before the field is loaded, but
+    after a given lighting was looked up.
 
     Raises:
         InputError: viser is missing, the scene has no field, or the lighting or the address is not valid.
@@ -132,6 +133,8 @@ def open_page(
 
     for stage in ("metric", "field"):
         require_stage(twin.scene, stage)
+    if lighting:  # a wrong name is told before the address
+        twin.field().embedding(lighting)
     server = open_server(host, port, "twin view")
     try:
         gui = server.viser.gui
