@@ -205,7 +205,7 @@ def test_films_and_settings_of_side_roads(filmed, place, spec):
     assert config.route.passes == ("sun",)
     assert [(one.name, one.passes) for one in config.branch] == [("side_1", ("sun_side_1",))]
     assert [(one.name, one.route) for one in config.task if one.route] == [("into_side_1", "side_1")]
-    assert "--place 28 --side-roads --out" in (root / "scene.toml").read_text()
+    assert "--place 28 --side-roads --tiny --lightings sun --out" in (root / "scene.toml").read_text()
     back = Truth.load(root / "truth")
     assert back.side_roads == truth.side_roads == {"side_1": 20.0}
     line, start, length = back.lines["side_1"]
