@@ -248,6 +248,23 @@ def test_a_second_signal_before_the_first_is_sent_again_loses_no_cleanup(capfd):
     assert _runs(work) == 128 + signal.SIGTERM and ended == [True]
 
 
+def test_a_signal_during_an_import_is_one_line(capfd):
+    """A module written in C that is interrupted while it is imported raises ImportError instead."""
+
+    def work():
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        except KeyboardInterrupt:
+            raise ImportError("initialization failed") from None
+
+    def broken():
+        raise ImportError("no such library")
+
+    assert _runs(work) == 128 + signal.SIGTERM and capfd.readouterr().err == "stopped\n"
+    with pytest.raises(ImportError, match="no such library"):
+        _runs(broken)
+
+
 def test_threads_leave_the_hook_alone():
     hook, seen = sys.unraisablehook, []
 

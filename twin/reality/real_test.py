@@ -99,7 +99,7 @@ def load_policy_file(path: Path) -> Policy:
     return load_policy(path)
 
 
-@lru_cache(maxsize=1)  # one needs 130 MB
+@lru_cache(maxsize=1)  # all policies drive in one weather before the next
 def rasterizer(
     lighting: str, intrinsics: tuple[float, ...], size: tuple[int, int], number: int, length: float = 0.0
 ) -> PlaceRenderer:
