@@ -238,11 +238,11 @@ def test_grip_grows_with_slip_over_rolling_speed(speed, share):
 
 
 @pytest.mark.slow
-def test_a_known_robot_is_recovered(tmp_path):
+def test_a_known_robot_is_recovered(drive, tmp_path):
     """The fit recovers the known parameters of a simulated drive, and predicts held-out windows far better than
     kinematics.
     """
-    windows = logs.cut_windows(columns(SOFT, 90.0, seed=1), "log")
+    windows = logs.cut_windows(drive, "log")
     result = identify(windows, HuskyParams())
     found = result.identified
     for name, tolerance in {
