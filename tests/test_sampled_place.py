@@ -183,6 +183,30 @@ def test_the_films_of_a_place_have_their_height_and_passes(places):
         assert text.count("[[task]]") == len(tasks(spec.line))
 
 
+@pytest.mark.parametrize("number", [3, 5])  # with and without a pass in the left lane
+def test_traffic_drives_through_nothing(places, number):
+    """Moving cars keep off the camera's track and off parked cars, in every pass; parked cars keep off the camera."""
+    place, plan = places[number], filming.FilmingPlan.of(sample_place(number))
+    parked = [solid for car in filming.parked_cars(place, plan.start, plan.length) for solid in car.solids]
+    stood = place.route.project(np.array([one.center[:2] for one in parked]))[1]
+    beside = [np.hypot(*one.half[:2]) if one.half[0] < one.half[1] else one.half[1] for one in parked]
+    assert len(parked) >= 4 and any(one.lateral > 1.0 for one in plan.passes) == (number == 3)
+    for one in plan.passes:
+        name = filming.film_name("sun", one)
+        times, poses = filming.trajectory(plan, place.route, name, one)
+        track = place.route.project(poses[:, :2, 3])[1]
+        assert np.abs(track[:, None] - stood).min() > max(beside) + 0.4
+        cars = [mover for mover in filming.movers(place, name, times, poses) if "car" in mover.name]
+        assert len(cars) == 2
+        for car in cars:
+            feet = np.array([car.pose(time)[0] for time in times])
+            seen = feet[:, 2] > -40.0
+            half = float(np.ptp(car.part.vertices[:, 1])) / 2
+            lateral = place.route.project(feet[seen, :2])[1]
+            assert seen.any() and np.abs(lateral - track[seen]).min() > half + 0.4
+            assert np.abs(lateral[:, None] - stood).min() > half + max(beside)
+
+
 def test_depth_agrees_with_rays_onto_the_ground(places):
     """Points of the road in a small picture lie on the true ground."""
     place = places[5]

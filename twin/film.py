@@ -73,9 +73,9 @@ def film(
     scene = load_scene(root)
     in_cache = is_cached(scene.scene.root)
     folder = out.parent if out else Path() if in_cache else scene.scene.root / "films"
-    require_writable(folder, "give another path with --out")
     driver, driver_name, options = _driver(scene, policy, seed, trust, options)
     environment = load(scene, task, seed, **options)
+    require_writable(folder, "give another path with --out")
     images: list[np.ndarray] = []
     motion: list[tuple[float, float]] = []
     cameras: list[np.ndarray] = []  # the camera's pose on the robot
