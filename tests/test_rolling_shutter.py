@@ -210,7 +210,7 @@ def test_a_shaky_film_with_a_rolling_shutter_is_built(tmp_path: Path) -> None:
     """The rotations of the cameras are wrong by 0.44° (median) without the correction."""
     plan = replace(FilmingPlan.of(sample_place(49)), lightings=("sun",), readout=0.03, shake=8.0)
     truth = film_place(plan, tmp_path, 49)
-    assert "--place 49 --readout 0.03 --shake 8 --out" in (tmp_path / "scene.toml").read_text()
+    assert "--place 49 --lightings sun --readout 0.03 --shake 8 --out" in (tmp_path / "scene.toml").read_text()
     build(tmp_path, until="metric")
     scene = SceneDir(tmp_path)
     metrics = read_json(scene.stage("cameras") / "stamp.json")["metrics"]
