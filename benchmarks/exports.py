@@ -100,7 +100,7 @@ def score_mesh(twin: Twin, lighting: str, size: tuple[int, int]) -> None:
     plain = trimesh.Trimesh(vertices, faces, vertex_colors=gltf.vertex_colors(coarse, vertices), process=False)
     start = time.perf_counter()
     fine = render_views(field, cameras, gltf.VIEWS, gltf.WIDTH, gltf.FAR, lighting)
-    content = gltf.textured_glb(vertices, faces, fine)
+    content = gltf.textured_glb(vertices, faces, fine, gltf.filmed_frames(cameras, lighting))
     seconds = time.perf_counter() - start
     read = trimesh.load(io.BytesIO(content), file_type="glb", process=False).to_geometry()
     read.vertices = read.vertices[:, [0, 2, 1]] * [1.0, -1.0, 1.0]  # glTF has y up, the scene z

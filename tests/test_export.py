@@ -142,7 +142,9 @@ def test_each_progress_bar_has_its_own_name(scene, tmp_path, monkeypatch) -> Non
     bar = runtime.bar
     monkeypatch.setattr(runtime, "bar", lambda what, *more, **how: (names.append(what), bar(what, *more, **how))[1])
     export(scene, None, ply=tmp_path / "a.ply", glb=tmp_path / "a.glb")
-    assert [name.split(",")[0] for name in names] == ["splats", "splats", "textures"] and len(set(names)) == len(names)
+    assert [name.split(",")[0] for name in names] == ["splats", "splats", "textures", "visible faces"] and len(
+        set(names)
+    ) == len(names)
 
 
 def test_a_baked_texture_shows_what_the_views_show() -> None:
@@ -168,6 +170,54 @@ def test_a_baked_texture_shows_what_the_views_show() -> None:
     encoded = io.BytesIO()
     Image.fromarray(texture).save(encoded, "JPEG", quality=95, subsampling=0)
     assert (np.asarray(read.visual.material.baseColorTexture) == np.asarray(Image.open(encoded))).all()
+
+
+FLOOR = np.array([[-0.4, -0.4, 0], [0.4, -0.4, 0], [0.4, 0.4, 0], [-0.4, 0.4, 0]]), np.array([[0, 1, 2], [2, 3, 0]])
+
+
+def frame_of(views, rgb: np.ndarray, used: bool = True) -> gltf.Pictures:
+    """A frame filmed at the pose of the first view."""
+    shape = views.depth[:1].shape
+    picture = np.broadcast_to(rgb, (*shape, 3)).astype(np.uint8)
+    return gltf.Pictures(views.camera_to_world[:1], views.intrinsics[:1], picture, np.full(shape, used))
+
+
+def test_frames_add_detail_and_what_passed_is_left_out() -> None:
+    """A view renders gray; the frame there is lighter, of another color (someone passed), or masked."""
+    views = floor_views([(0.0, -0.2, 2.0)])
+    views = replace(views, rgb=np.full_like(views.rgb, 120))
+    for frame, mean in (
+        (frame_of(views, np.array([150, 150, 150])), 135),
+        (frame_of(views, np.array([230, 60, 60])), 120),
+        (frame_of(views, np.array([150, 150, 150]), used=False), 120),
+    ):
+        texture, coordinates = gltf.bake(*FLOOR, views, [frame])
+        u, v = np.floor(coordinates.mean(1) * texture.shape[1::-1]).astype(int).T
+        assert np.abs(texture[v, u].astype(int) - mean).max() <= 1
+
+
+def test_a_face_has_no_color_of_what_stands_before_it() -> None:
+    """A wall hides half of the floor from one of two views, which shows it in another color."""
+    views = floor_views([(0.0, -1.5, 1.0), (0.0, 0.0, 2.0)])
+    rgb = np.full_like(views.rgb, 120)
+    rgb[0] = 60
+    views = replace(views, rgb=rgb)
+    wall = np.array([[-3, -0.6, -0.5], [3, -0.6, -0.5], [3, -0.6, 3], [-3, -0.6, 3.0]])
+    vertices, faces = np.concatenate([FLOOR[0], wall]), np.concatenate([FLOOR[1], FLOOR[1] + 4])
+    texture, coordinates = gltf.bake(vertices, faces, views)
+    u, v = np.floor(coordinates.mean(1) * texture.shape[1::-1]).astype(int).T
+    assert (texture[v, u][:2] == 120).all() and (texture[v, u][2:] < 80).all()  # the other view grazes the wall
+
+
+def test_training_frames_of_the_lighting_are_baked(scene) -> None:
+    cameras = load_scene(scene).cameras()
+    for lighting in set(cameras.lightings):
+        wanted = np.flatnonzero(~cameras.held_out & (np.array(cameras.lightings) == lighting))
+        frames = gltf.filmed_frames(cameras, lighting)
+        assert [frame.camera_to_world[0].tolist() for frame in frames] == cameras.camera_to_world[wanted].tolist()
+        assert (frames[0].rgb[0] == read_image(cameras.image_path(wanted[0]))).all()
+    assert [bool(frame.masks.all()) for frame in gltf.filmed_frames(cameras, "night")] == [True, False, True]
+    assert gltf.filmed_frames(replace(cameras, images=cameras.images / "absent"), cameras.lightings[0]) == []
 
 
 def test_tiles_do_not_overlap() -> None:

@@ -153,8 +153,9 @@ def _field_files(
             )
     if glb:
         views_of_one = render_views(field, cameras, gltf.VIEWS, gltf.WIDTH, gltf.FAR, lighting, f"textures, {lighting}")
-        write_bytes(glb, gltf.textured_glb(mesh["vertices"].astype(np.float64), mesh["faces"], views_of_one))
-        lines.append(f"{glb}: {len(mesh['faces'])} textured faces under {lighting}, y up [m]")
+        frames = gltf.filmed_frames(cameras, lighting)
+        write_bytes(glb, gltf.textured_glb(mesh["vertices"].astype(np.float64), mesh["faces"], views_of_one, frames))
+        lines.append(f"{glb}: {len(mesh['faces'])} faces with colors of {lighting}: {len(frames)} frames; y up [m]")
     return lines
 
 

@@ -1,15 +1,19 @@
-"""glTF file (`.glb`) of the visual mesh with a texture baked from the radiance field under one lighting.
+"""glTF file (`.glb`) of the visual mesh with a texture baked under one lighting, from the field and from the film.
 
 Every face has its own square of the texture, its *tile*. On the face, a *texel* (pixel of the texture) is about as
-large as a pixel of the nearest rendered view. Its color is a mean over the views that show its point of the face; near
-and frontal views have the largest weights. The material is unlit (KHR_materials_unlit), since filmed colors include the
-light. In glTF, y points up.
+large as a pixel of the nearest rendered view. Its color is a mean over the *pictures* in which nothing of the mesh
+hides its point of the face: views rendered from the radiance field, and training frames filmed under the lighting. Near
+and frontal pictures have the largest weights. A frame is left out where its color differs much from the views', since
+something that moved or left may hide the point. The material is unlit (KHR_materials_unlit), since filmed colors
+include the light. In glTF, y points up.
 """
 
 # mypy: disable-error-code="index, attr-defined"
 # (mypy does not know the types that Warp uses inside kernels)
 
 import io
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,35 +22,57 @@ from numpy.typing import NDArray
 from PIL import Image as PillowImage
 from scipy.spatial import cKDTree
 
+from twin import runtime
 from twin.assets.views import Views
 from twin.errors import InputError
-from twin.geometry.cameras import project
+from twin.geometry.cameras import Cameras, pixel_grid, project, unproject
+from twin.geometry.mesh_rays import Surface
 from twin.geometry.poses import inverse_pose
+from twin.nerf.dataset import load_frame
 from twin.types import Array, Image
 from twin.warp_runtime import wp
 
 VIEWS, WIDTH, FAR = 96, 640, 100.0
-"""Number of views that the texture is baked from, their width [px], and the z-depth where background starts [m]."""
+"""Number of rendered views, width of all pictures [px], and the z-depth where background starts [m]."""
 _Z_UP_TO_Y_UP = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 _SIDE = 4096  # [px] largest width of the texture; every viewer supports this size
 _MIN_TEXEL = 0.01  # [m] least side of a texel on its face
 _MAX_TILE = 256  # [px] greatest side of a face's tile
 _COARSER = 1.1  # factor by which texels grow until all tiles fit
 _DEPTH_TOLERANCE = 0.03  # a vertex is visible up to this relative difference from the rendered depth
-# Larger for texels: the mesh is smoother than the field, so a face may lie before or behind the surface in a view.
-_TEXEL_TOLERANCE = 0.08
-_SHARPNESS = 2.0  # a view's weight is this power of cos(angle between ray and normal) / depth²
+_SAME_DEPTH = 0.02  # a texel is visible where its z-depth and the mesh's differ by less than this share
+_MOST_DIFFERENT = 100.0  # [of 255] largest difference of a frame's color from the views', over all channels (norm)
 _CHUNK = 2_000_000  # texels computed at once
 _JPEG_QUALITY = 95
 
 
-def textured_glb(vertices: Array, faces: NDArray, views: Views) -> bytes:
-    """The `.glb` of a mesh with vertices (v, 3) [m] and faces (f, 3), its texture baked from views of one lighting.
+@dataclass(frozen=True)
+class Pictures:
+    """n pictures of one size and lighting."""
+
+    camera_to_world: Array  # shape (n, 4, 4)
+    intrinsics: Array  # fx, fy, cx, cy [px], shape (n, 4)
+    rgb: NDArray[np.uint8]  # shape (n, h, w, 3)
+    masks: NDArray[np.bool_]  # pixels to use, shape (n, h, w)
+
+
+def filmed_frames(cameras: Cameras, lighting: str) -> list[Pictures]:
+    """The training frames filmed under a lighting, each at most `WIDTH` wide; none if the scene lacks its films."""
+    frames = []
+    for i in np.flatnonzero(~cameras.held_out & (np.array(cameras.lightings) == lighting)).tolist():
+        if cameras.image_path(i).exists():
+            rgb, mask, intrinsics = load_frame(cameras, i, WIDTH)
+            frames.append(Pictures(cameras.camera_to_world[i : i + 1], intrinsics[None], rgb[None], mask[None]))
+    return frames
+
+
+def textured_glb(vertices: Array, faces: NDArray, views: Views, frames: Sequence[Pictures] = ()) -> bytes:
+    """The `.glb` of a mesh with vertices (v, 3) [m] and faces (f, 3), its texture baked from pictures of one lighting.
 
     Raises:
         InputError: no view shows the mesh.
     """
-    texture, coordinates = bake(vertices, faces, views)
+    texture, coordinates = bake(vertices, faces, views, frames)
     encoded = io.BytesIO()
     PillowImage.fromarray(texture).save(encoded, "JPEG", quality=_JPEG_QUALITY, subsampling=0)
     picture = PillowImage.open(encoded)
@@ -73,7 +99,9 @@ def textured_glb(vertices: Array, faces: NDArray, views: Views) -> bytes:
     return trimesh.exchange.gltf.export_glb(trimesh.Scene(surface), tree_postprocessor=unlit)
 
 
-def bake(vertices: Array, faces: NDArray, views: Views) -> tuple[Image, NDArray[np.float64]]:
+def bake(
+    vertices: Array, faces: NDArray, views: Views, frames: Sequence[Pictures] = ()
+) -> tuple[Image, NDArray[np.float64]]:
     """Returns the texture (h, w, 3) and texture coordinates (f, 3, 2) of the faces' corners: u from left, v from top.
 
     Raises:
@@ -87,7 +115,10 @@ def bake(vertices: Array, faces: NDArray, views: Views) -> tuple[Image, NDArray[
     u_axis, v_axis = ((corner[:, k] - corner[:, 0]) / (side - 1)[:, None] for k in (1, 2))
     normal = np.cross(u_axis, v_axis)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
-    uploaded = _upload_views(views)
+    rendered = Pictures(views.camera_to_world, views.intrinsics, views.rgb, np.ones(views.depth.shape, bool))
+    surface = Surface(vertices, faces)
+    with runtime.bar("visible faces", len(views) + len(frames), "picture") as bar:
+        uploaded = [_upload_pictures(pictures, surface, bar.update) for pictures in (rendered, *frames)]
     means = np.full((len(faces), 3), np.nan)
     counts = side**2
     start = 0
@@ -164,14 +195,12 @@ def _gather(
     intrinsics: wp.array[wp.vec4],
     rgb: wp.array4d[wp.uint8],
     depth: wp.array3d[float],
-    tolerance: float,
-    sharpness: float,
-    out: wp.array[wp.vec3],
-    total: wp.array[float],
+    wanted: wp.array[wp.vec3],
+    most_different: float,
+    colors: wp.array[wp.vec3],
+    weights: wp.array[float],
 ):
     t = wp.tid()
-    color = wp.vec3(0.0)
-    weight = float(0.0)
     height, width = depth.shape[1], depth.shape[2]
     for i in range(depth.shape[0]):
         local = wp.transform_point(world_to_camera[i], points[t])
@@ -182,44 +211,67 @@ def _gather(
             v = k[1] * local[1] / z + k[3] - 0.5
             if u >= 0.0 and v >= 0.0 and u < float(width - 1) and v < float(height - 1):
                 a, b = int(u), int(v)
-                rendered = depth[i, int(v + 0.5), int(u + 0.5)]
-                if wp.abs(rendered - z) < tolerance * z:
-                    facing = wp.abs(wp.dot(wp.transform_vector(world_to_camera[i], normals[t]), wp.normalize(local)))
-                    share = wp.pow(wp.max(facing, 0.02) / (z * z), sharpness)
-                    x, y = u - float(a), v - float(b)
-                    for dv in range(2):
-                        for du in range(2):
-                            part = (x if du == 1 else 1.0 - x) * (y if dv == 1 else 1.0 - y) * share
+                x, y = u - float(a), v - float(b)
+                color = wp.vec3(0.0)
+                visible = float(0.0)
+                for dv in range(2):
+                    for du in range(2):
+                        if wp.abs(depth[i, b + dv, a + du] - z) < _SAME_DEPTH * z:
+                            part = (x if du == 1 else 1.0 - x) * (y if dv == 1 else 1.0 - y) + 1.0e-3
+                            visible += part
                             color += part * wp.vec3(
                                 float(rgb[i, b + dv, a + du, 0]),
                                 float(rgb[i, b + dv, a + du, 1]),
                                 float(rgb[i, b + dv, a + du, 2]),
                             )
-                    weight += share
-    total[t] = weight
-    if weight > 0.0:
-        out[t] = color / weight
+                if visible > 0.0:
+                    mean = color / visible
+                    if wp.length(mean - wanted[t]) < most_different:
+                        facing = wp.dot(wp.transform_vector(world_to_camera[i], normals[t]), wp.normalize(local))
+                        share = wp.max(wp.abs(facing), 0.02) / (z * z)
+                        colors[t] += share * mean
+                        weights[t] += share
 
 
 def _upload(values: NDArray, kind: Any) -> Any:
     return wp.array(np.ascontiguousarray(values), dtype=kind, device="cpu")
 
 
-def _upload_views(views: Views) -> list[Any]:
-    """Views as Warp arrays: poses (world to camera), intrinsics, colors, depths."""
-    inverse = np.stack([inverse_pose(pose) for pose in views.camera_to_world])
-    kinds = ((inverse, wp.mat44), (views.intrinsics, wp.vec4), (views.depth, float))
+def _upload_pictures(pictures: Pictures, mesh: Surface, told: Callable[[], object]) -> list[Any]:
+    """Pictures as Warp arrays: poses (world to camera), intrinsics, colors, and z-depth of the mesh, 0 where masked.
+
+    Calls `told` after each picture.
+    """
+    shape = pictures.masks.shape
+    depth = np.empty(shape, np.float32)
+    for i, (pose, intrinsics) in enumerate(zip(pictures.camera_to_world, pictures.intrinsics, strict=True)):
+        rays = unproject(pixel_grid(shape[2], shape[1]), intrinsics).reshape(-1, 3) @ pose[:3, :3].T
+        depth[i] = mesh.cast(np.broadcast_to(pose[:3, 3], rays.shape), rays).reshape(shape[1:])
+        told()
+    inverse = np.stack([inverse_pose(pose) for pose in pictures.camera_to_world])
+    kinds = ((inverse, wp.mat44), (pictures.intrinsics, wp.vec4), (depth * pictures.masks, float))
     poses, intrinsics, depth = (_upload(values.astype(np.float32), kind) for values, kind in kinds)
-    return [poses, intrinsics, _upload(views.rgb, wp.uint8), depth]
+    return [poses, intrinsics, _upload(pictures.rgb, wp.uint8), depth]
 
 
-def _colors(views: list[Any], points: Array, normals: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Colors (k, 3) in [0, 255] of points (k, 3) with unit normals, and weights (k,), 0 for unseen points."""
+def _colors(uploaded: list[list[Any]], points: Array, normals: Array) -> tuple[NDArray, NDArray[np.float32]]:
+    """Colors (k, 3) in [0, 255] of points (k, 3) with unit normals, and weights (k,), 0 for unseen points.
+
+    The first element of `uploaded` has the rendered views, the others have the frames.
+    """
+    count = len(points)
     given = [_upload(x.astype(np.float32), wp.vec3) for x in (points, normals)]
-    out = wp.zeros(len(points), dtype=wp.vec3, device="cpu")
-    total = wp.zeros(len(points), dtype=float, device="cpu")
-    wp.launch(_gather, len(points), [*given, *views, _TEXEL_TOLERANCE, _SHARPNESS], [out, total], device="cpu")
-    return out.numpy().copy(), total.numpy()
+    out = [wp.zeros(count, dtype=wp.vec3, device="cpu"), wp.zeros(count, dtype=float, device="cpu")]
+    views, *frames = uploaded
+    wp.launch(_gather, count, [*given, *views, wp.zeros_like(out[0]), np.inf], out, device="cpu")
+    shown, weight = (values.numpy() for values in out)
+    # A point that no view shows has no color to compare with, so no frame may show it, either.
+    shown = np.where(weight[:, None] > 0.0, shown / np.maximum(weight, 1e-20)[:, None], np.inf)
+    wanted = _upload(shown.astype(np.float32), wp.vec3)
+    for frame in frames:
+        wp.launch(_gather, count, [*given, *frame, wanted, _MOST_DIFFERENT], out, device="cpu")
+    total, weight = (values.numpy() for values in out)
+    return total / np.maximum(weight, 1e-20)[:, None], weight
 
 
 def vertex_colors(views: Views, vertices: Array) -> NDArray[np.uint8]:
