@@ -18,7 +18,7 @@ from record import record_parser, save
 
 from twin.geometry.cameras import Cameras, Viewpoints, pixel_grid, unproject
 from twin.geometry.images import psnr, resize, write_image
-from twin.geometry.mesh_rays import ShadowCasters, angles
+from twin.geometry.shadow_map import ShadowCasters, angles
 from twin.loading import load_scene
 from twin.nerf.baked import BakedField
 from twin.nerf.lightings import Fog

@@ -24,8 +24,9 @@ from twin.env.picture_effects import Weather
 from twin.errors import InputError
 from twin.files import load_arrays
 from twin.geometry.cameras import Viewpoints, pixel_grid, unproject
-from twin.geometry.mesh_rays import OrthographicShadowMap, ShadowCasters, Surface, angles, direction
+from twin.geometry.mesh_rays import Surface
 from twin.geometry.poses import look_at
+from twin.geometry.shadow_map import OrthographicShadowMap, ShadowCasters, angles, direction
 from twin.nerf.lightings import AddedLighting, Fog
 from twin.nerf.sun import (
     TERMS,
@@ -122,7 +123,7 @@ def test_memory_of_a_shadow_map_is_bounded(monkeypatch):
     finally:
         tracemalloc.stop()
     assert made.height.size > 400_000 and peak < 20 << 20
-    monkeypatch.setattr("twin.geometry.mesh_rays._BATCH", 1 << 30)
+    monkeypatch.setattr("twin.geometry.shadow_map._BATCH", 1 << 30)
     np.testing.assert_array_equal(casters.seen_from(toward, texel=0.01).height, made.height)
 
 

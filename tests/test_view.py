@@ -38,8 +38,8 @@ from twin.errors import InputError
 from twin.files import parse_toml
 from twin.geometry.cameras import Cameras, Viewpoints
 from twin.geometry.images import to_uint8, write_image
-from twin.geometry.mesh_rays import OrthographicShadowMap
 from twin.geometry.poses import look_at
+from twin.geometry.shadow_map import OrthographicShadowMap
 from twin.loading import Twin
 from twin.nerf.lightings import Fog
 from twin.nerf.sun import Sun

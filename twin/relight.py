@@ -25,7 +25,7 @@ from twin.errors import InputError
 from twin.files import load_arrays
 from twin.geometry.cameras import Cameras, RenderableField, pixel_grid, unproject
 from twin.geometry.images import psnr, resize, to_uint8, write_image
-from twin.geometry.mesh_rays import ShadowCasters, angles, direction
+from twin.geometry.shadow_map import ShadowCasters, angles, direction
 from twin.nerf.lightings import AddedLighting, Fog, check_new_name
 from twin.nerf.sun import Sun, heading_from_gps, parse_time, sun_direction
 from twin.scene import SceneDir, require_stage, stage_result

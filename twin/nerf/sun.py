@@ -9,7 +9,7 @@ picture under the lighting's embedding times a gain. The gain of each color chan
 
 The coefficients `level` and `direct` differ if the ground lies in shadows of unfilmed objects, or if its color
 saturates. Here n is the normal of the surface, s the direction towards the sun, d the direction of view. The visibility
-comes from a shadow map (`geometry/mesh_rays.py`). Between the z-depths `_NEAR` and `_FAR`, the gain is interpolated
+comes from a shadow map (`geometry/shadow_map.py`). Between the z-depths `_NEAR` and `_FAR`, the gain is interpolated
 between the sums for the surface and for the far view. The coefficients are fitted to a photo (`sun_fit.py`). They are
 ratios to the light of the film, in the film's tone curve.
 
@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.errors import InputError
-from twin.geometry.mesh_rays import OrthographicShadowMap, direction
+from twin.geometry.shadow_map import OrthographicShadowMap, direction
 from twin.types import Array, Array32
 
 TERMS = ("ambient", "direct", "base", "toward", "up", "level")

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from twin import runtime
 from twin.geometry.images import psnr
-from twin.geometry.mesh_rays import TEXEL, OrthographicShadowMap, ShadowCasters, angles, direction
+from twin.geometry.shadow_map import TEXEL, OrthographicShadowMap, ShadowCasters, angles, direction
 from twin.nerf import network
 from twin.nerf.appearance import FogFit, descend
 from twin.nerf.lightings import FOG_REACH, Fog
