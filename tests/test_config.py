@@ -7,7 +7,7 @@ from twin import commands
 from twin.config import CAMERA_MODELS, MARKER_FAMILIES, SceneConfig
 from twin.config_file import _SECTIONS, load_config
 from twin.errors import InputError
-from twin.types import setting_ranges
+from twin.ranges import setting_ranges
 
 _SOURCE = '[[source]]\npath = "a.mp4"\n'
 _MINIMAL = "metric.camera_height = 1.2\n" + _SOURCE

@@ -8,8 +8,8 @@ end.
 from dataclasses import dataclass, field
 from typing import Annotated
 
+from twin.ranges import Range
 from twin.robot import HuskyParams
-from twin.types import Range
 
 TRAINING, HELD_OUT, ANY = "training", "held-out", "any"
 """Names that stand for a lighting sampled for each episode; see `twin/env/episode_lighting.py`."""

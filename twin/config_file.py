@@ -33,9 +33,9 @@ from twin.config import (
 )
 from twin.errors import InputError, name_hint, short_repr
 from twin.files import exists, is_link, parse_toml, read_toml
+from twin.ranges import Range, check_range, check_ranges
 from twin.robot import HuskyParams
 from twin.scene import MAX_NAME
-from twin.types import Range, setting_ranges
 
 ROBOT_TOML = "robot.toml"
 
@@ -171,9 +171,9 @@ def _check(config: SceneConfig, folder: str) -> None:
     printable = config.name.isprintable() or config.name == folder
     _require(printable, f"name = {config.name!r}; expected a text without control characters")
     _check_tasks(config.task)
-    _check_ranges(config)
+    check_ranges(config)
     for section in _SECTIONS:
-        _check_ranges(getattr(config, section), f"{section}.")
+        check_ranges(getattr(config, section), f"{section}.")
     _check_segments(config.capture.keep, "capture.keep")
     _check_route(config.route, "route")
     _check_branches(config)
@@ -195,19 +195,6 @@ def _require(condition: object, message: str) -> None:
         raise InputError(message)
 
 
-def _check_ranges(settings: Any, prefix: str = "", suffix: str = "") -> None:
-    """Checks the fields of a dataclass that have a range; prefix and suffix of their names are for the messages."""
-    kind: type = type(settings)
-    for key, bounds in setting_ranges(kind).items():
-        _check_range(getattr(settings, key), bounds, f"{prefix}{key}{suffix}")
-
-
-def _check_range(value: float, bounds: Range, what: str) -> None:
-    low, high = bounds.low, bounds.high
-    expected = f"at least {low:,.10g}" if high == math.inf else f"{low:,.10g} to {high:,.10g}"
-    _require(low <= value <= high, f"{what} = {value:,.10g}; expected {expected}")
-
-
 def _check_source(source: SourceConfig) -> None:
     _require(source.path, "a [[source]] has no path; give the video or the image folder")
     for key in ("path", "images", "mask"):
@@ -215,7 +202,7 @@ def _check_source(source: SourceConfig) -> None:
         _require("\0" not in value, f"{key} = {value!r}; expected a path without NUL characters")
     what = f"of [[source]] {source.path!r}"
     _check_choice(source.kind, KINDS, "kind")
-    _check_ranges(source, suffix=f" {what}")
+    check_ranges(source, suffix=f" {what}")
     _check_segments(source.keep, f"keep {what}")
     if source.lighting:
         check_lighting(source.lighting, f"lighting {what}")
@@ -263,7 +250,7 @@ def _check_branches(config: SceneConfig) -> None:
         _check_name(branch.name, "[[branch]] name")
         what = f"[[branch]] {branch.name!r}"
         _require(branch.passes or branch.points, f"{what} has neither passes nor points; give one of them")
-        _check_ranges(branch, f"{what} ")
+        check_ranges(branch, f"{what} ")
         _check_route(branch, what)
     names = [branch.name for branch in config.branch]
     _check_unique(["route", *names], "routes")
@@ -292,7 +279,7 @@ def _check_metric(metric: MetricConfig) -> None:
     if metric.marker is not None:
         family, size = metric.marker.family, metric.marker.size
         _check_choice(family, MARKER_FAMILIES, "metric.marker.family")
-        _check_range(metric.marker.id, Range(0, MARKER_FAMILIES[family] - 1), "metric.marker.id")
+        check_range(metric.marker.id, Range(0, MARKER_FAMILIES[family] - 1), "metric.marker.id")
         _require(size > 0.0, f"metric.marker.size = {size:g}; expected the side of the black square [m]")
     if metric.distance is not None:
         metres, frame = metric.distance.metres, metric.distance.frame_a

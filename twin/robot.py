@@ -14,7 +14,8 @@ from typing import Annotated
 import numpy as np
 
 from twin.errors import InputError
-from twin.types import Array, Range, setting_ranges
+from twin.ranges import Range, check_ranges
+from twin.types import Array
 
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 """Order of all arrays per wheel; body, joint and encoder of a wheel are named `<name>_wheel`."""
@@ -187,10 +188,7 @@ class HuskyParams:
             raise InputError(f"camera_intrinsics = {list(self.camera_intrinsics)}; expected [fx, fy, cx, cy]")
         if self.camera_intrinsics and min(self.camera_intrinsics[:2]) <= 0:
             raise InputError(f"camera_intrinsics = {list(self.camera_intrinsics)}; expected fx, fy > 0 [px]")
-        for name, bound in setting_ranges(HuskyParams).items():
-            for value in np.atleast_1d(getattr(self, name)).tolist():
-                if not bound.low <= value <= bound.high:
-                    raise InputError(f"{name} = {value:g}; expected {bound.low:g} to {bound.high:g}")
+        check_ranges(self)
         if self.wheel_shape not in ("ellipsoid", "cylinder"):
             raise InputError(f"wheel_shape = {self.wheel_shape!r}; expected ellipsoid or cylinder")
         if self.controller not in CONTROLLERS:

@@ -13,7 +13,7 @@ from twin.env.options import CPU, CUDA, NERF, SIMULATOR, Rewards
 from twin.errors import InputError, short_repr
 from twin.learn.policy import Control
 from twin.learn.policy_network import Architecture
-from twin.types import Range, setting_ranges
+from twin.ranges import Range, check_ranges
 
 _CHOICES = {"observe": (NERF, SIMULATOR), "action": (STEERING, TWIST), "device": (CPU, CUDA)}
 
@@ -21,12 +21,6 @@ _PER_CYCLE = 20.0  # [m] of a task per cycle of the learning rate
 
 _ROBOT_ONLY = Ranges(extinction=(0.0, 0.0), sunlight=(0.0, 0.0), shade=(0.0, 0.0), bystanders=(0, 0))
 """Randomizes only the robot; the place looks as filmed."""
-
-
-def _numbers(value: Any) -> list[Any]:
-    """All numbers in `value`: a number, a tuple of numbers, or a tuple of such tuples."""
-    groups = value if isinstance(value, tuple | list) else (value,)
-    return [number for group in groups for number in (group if isinstance(group, tuple | list) else (group,))]
 
 
 def steps_for(length: float) -> int:
@@ -117,11 +111,7 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         """Raises InputError: a value is out of range, or the lighting is reserved for validation."""
-        for name, of in setting_ranges(TrainConfig).items():
-            given = getattr(self, name)
-            for value in _numbers(given):
-                if isinstance(value, bool) or not isinstance(value, int | float) or not of.low <= value <= of.high:
-                    raise InputError(f"{name} = {short_repr(given)}; expected {of.low:,.10g} to {of.high:,.10g}")
+        check_ranges(self)
         for name, valid in _CHOICES.items():
             if getattr(self, name) not in valid:
                 choices = " or ".join(map(repr, valid))

@@ -18,13 +18,14 @@ from scipy.special import expit
 
 from twin.errors import InputError
 from twin.geometry.cameras import pixel_grid, unproject
+from twin.ranges import Range, setting_ranges
 from twin.reality import SEED
 from twin.reality.filming import FilmingPlan, motion_between, read_rows, smooth_noise
 from twin.reality.lighting import Lighting
 from twin.reality.rasterizer import PlaceRenderer
 from twin.reality.real_robot import RealRobot
 from twin.reality.sky import apply_haze
-from twin.types import Array, Array32, Image, Range, setting_ranges
+from twin.types import Array, Array32, Image
 
 # ---- one camera's numbers
 

@@ -34,9 +34,10 @@ from typing import Annotated
 import numpy as np
 
 from twin.errors import InputError
+from twin.ranges import Range, setting_ranges
 from twin.reality import SEED
 from twin.reality.place_objects import KnownPlace, Solids
-from twin.types import Array, Range, setting_ranges
+from twin.types import Array
 
 # ---- facts (Clearpath's description of the Husky A200)
 
