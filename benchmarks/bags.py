@@ -28,7 +28,7 @@ from twin.capture.video import FilmStatistics, decode, upright
 from twin.errors import InputError
 from twin.files import digest_file, remove, toml_string, write_text
 from twin.geometry.cameras import Cameras
-from twin.geometry.poses import inverse_pose
+from twin.geometry.poses import inverse_pose, pose_of
 from twin.new import new_scene
 from twin.reality.recordings import BagMessages
 from twin.reality.truth import Truth, camera_errors, compare, matched_poses
@@ -61,9 +61,8 @@ def write_bag(path: Path, film: Path, truth: Truth, name: str, seed: int) -> Non
     height = truth.camera_height
     # The camera on the robot is pitched by the mean pitch of the film's poses.
     pitch = float(np.mean(np.arcsin(-poses[:, 2, 2])))
-    seat = np.eye(4)
-    seat[:3, :3] = Rotation.from_euler("Y", pitch).as_matrix() @ CAMERA_AHEAD
-    seat[:3, 3] = (_AHEAD, 0.0, height - _BASE)
+    turn = Rotation.from_euler("Y", pitch).as_matrix() @ CAMERA_AHEAD
+    seat = pose_of(turn, np.array([_AHEAD, 0.0, height - _BASE]))
     records: list[tuple[int, str, str, Any]] = []
 
     def add(time: float, topic: str, kind: str, message: Any) -> None:

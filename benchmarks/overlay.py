@@ -27,7 +27,7 @@ from twin.env.obstacles import ObstacleModel, add_obstacle_geoms, add_obstacles,
 from twin.env.physics import camera_pose
 from twin.geometry.cameras import Cameras, opencv_to_mujoco, pixel_grid, unproject
 from twin.geometry.polyline import arc_lengths, heading_at, point_at
-from twin.geometry.poses import Similarity
+from twin.geometry.poses import Similarity, pose_of
 from twin.loading import load_scene
 from twin.mjcf.world import World
 from twin.reality import true_world as reality
@@ -171,11 +171,8 @@ def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str,
                 empty = compositors["shaded"].render([data], lighting)
                 place(placed, data, 0.0)
                 mujoco.mj_forward(model, data)
-                pose = np.eye(4)
-                pose[:3, :3], pose[:3, 3] = (
-                    data.body(f"obstacle_{kind}").xmat.reshape(3, 3),
-                    data.body(f"obstacle_{kind}").xpos,
-                )
+                body = data.body(f"obstacle_{kind}")
+                pose = pose_of(body.xmat.reshape(3, 3), body.xpos)
                 true_eye, true_pose = to_truth.poses(eye), to_truth.poses(pose)
                 empty_truth, empty_truth_depth = true_world.render(true_eye, None, true_pose)
                 truth_rgb, depth = true_world.render(true_eye, kind, true_pose)

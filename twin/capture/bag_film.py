@@ -47,6 +47,7 @@ from twin.capture.camera_models import Lens, checked_lens, same_aspect
 from twin.capture.capture_data import nearest_longitudes
 from twin.capture.video import Film, FilmStatistics, FilmTiming
 from twin.errors import InputError, join_names
+from twin.geometry.poses import pose_of
 from twin.robot import BASE_HEIGHT, CAMERA_AHEAD
 from twin.types import Array, Image
 
@@ -363,8 +364,7 @@ def _add_transforms(transforms: dict[str, tuple[str, Array]], message: Any) -> N
         values = np.array([p.x, p.y, p.z, *unit_quaternion(one.transform.rotation)])
         if not np.isfinite(values).all():
             continue
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = Rotation.from_quat(values[3:]).as_matrix(), values[:3]
+        pose = pose_of(Rotation.from_quat(values[3:]).as_matrix(), values[:3])
         transforms[one.child_frame_id.strip("/")] = (one.header.frame_id.strip("/"), pose)
 
 

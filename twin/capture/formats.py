@@ -24,7 +24,7 @@ from twin.errors import InputError, short_repr
 from twin.files import is_file, read_bytes, read_json, wrap_read_errors
 from twin.geometry.cameras import opencv_to_mujoco
 from twin.geometry.images import HEIF_SUFFIXES, image_size
-from twin.geometry.poses import inverse_pose
+from twin.geometry.poses import inverse_pose, pose_of
 from twin.types import Array
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm", ".jp2", *HEIF_SUFFIXES)
@@ -73,10 +73,8 @@ def read_model(model: Path) -> list[tuple[str, Lens, Array]]:
             raise InputError(f"{images_path}: an image is named {name!r}; expected a path below the image folder")
         if not np.abs(values).max() < _MAX_POSE_VALUE or (length := float(np.linalg.norm(values[:4]))) < 1e-6:
             raise InputError(f"{images_path}: the pose of {name} is not finite; remove that image or export again")
-        pose = np.eye(4)
-        pose[:3, :3] = rotation_from_quaternion(values[:4] / length)
-        pose[:3, 3] = values[4:]
-        posed.append((name, lenses[camera_id], inverse_pose(pose)))
+        world_to_camera = pose_of(rotation_from_quaternion(values[:4] / length), values[4:])
+        posed.append((name, lenses[camera_id], inverse_pose(world_to_camera)))
     return posed
 
 
@@ -359,10 +357,8 @@ def _rigid_pose(value: Any, where: str) -> Array:
             f"{where}: transform_matrix is not rigid (RᵀR is off by {wrong:.2g}, det {np.linalg.det(rotation):.2g}); "
             "expected a rotation and a translation"
         )
-    pose = np.eye(4)
     u, _, vt = np.linalg.svd(rotation)  # the nearest rotation, since the file's numbers may be rounded
-    pose[:3, :3], pose[:3, 3] = u @ vt, matrix[:3, 3]
-    return pose
+    return pose_of(u @ vt, matrix[:3, 3])
 
 
 def _undo_world_transform(table: dict[str, Any], path: Path) -> tuple[Array, float]:

@@ -22,6 +22,7 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
 
 from twin.capture.pair_geometry import Pair, PairGeometry, ordered_pair, with_rotation
+from twin.geometry.poses import pose_of
 from twin.types import Array
 
 _OUTLIER = 3.0  # [standard deviations] scale of the Cauchy loss
@@ -81,10 +82,7 @@ def averaged_poses(
     frames, positions, _ = solve_differences(
         Differences(second[kept], first[kept], units[:, None] * directions[kept], errors, cost[kept]), len(film)
     )
-    poses = np.tile(np.eye(4), (len(frames), 1, 1))
-    poses[:, :3, :3] = np.swapaxes(rotations[frames], 1, 2)
-    poses[:, :3, 3] = positions[frames]
-    return frames, poses
+    return frames, pose_of(np.swapaxes(rotations[frames], 1, 2), positions[frames])
 
 
 def _goes_along(

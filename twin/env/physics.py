@@ -16,6 +16,7 @@ import numpy as np
 from twin.env.controller import CONTROL_PERIOD, Controller, wheel_speeds
 from twin.errors import InputError
 from twin.geometry.cameras import opencv_to_mujoco
+from twin.geometry.poses import pose_of
 from twin.mjcf.scene_xml import rest_pose
 from twin.robot import GEAR_RATIO, SIDES, WHEEL_RADIUS, WHEELS, HuskyParams
 from twin.types import Array
@@ -228,7 +229,7 @@ class HuskyPhysics:
     @property
     def base_to_world(self) -> Array:
         """Pose of the base, shape (4, 4)."""
-        return _pose(self.data.xpos[self._body], self.data.xmat[self._body])
+        return pose_of(self.data.xmat[self._body].reshape(3, 3), self.data.xpos[self._body])
 
     @property
     def planar_pose(self) -> Array:
@@ -298,11 +299,4 @@ class HuskyPhysics:
 
 def camera_pose(data: mujoco.MjData, camera: int) -> Array:
     """camera_to_world of a camera, OpenCV axes, shape (4, 4)."""
-    return opencv_to_mujoco(_pose(data.cam_xpos[camera], data.cam_xmat[camera]))
-
-
-def _pose(position: Array, matrix: Array) -> Array:
-    pose = np.eye(4)
-    pose[:3, :3] = matrix.reshape(3, 3)
-    pose[:3, 3] = position
-    return pose
+    return opencv_to_mujoco(pose_of(data.cam_xmat[camera].reshape(3, 3), data.cam_xpos[camera]))

@@ -27,6 +27,7 @@ from twin.env.physics import TIME_TOLERANCE
 from twin.env.task import DrivePhysics, DriveTask, Motion, RewardAndTermination, control
 from twin.env.vector_env_local import LocalVectorEnv, StepResult
 from twin.geometry.cameras import opencv_to_mujoco
+from twin.geometry.poses import pose_of
 from twin.runtime import available_cores
 from twin.types import Array, Indices
 from twin.warp_runtime import wp
@@ -235,10 +236,10 @@ class GpuSimulation:
         qpos, time = self._state["qpos"][which, :7], self._controllers.time[which]
         if len(self._snapshot_times):
             qpos, time = self._delayed_base_poses(which)
-        matrix, pose = _rotation_matrices(qpos[:, 3:]), np.tile(np.eye(4), (len(which), 1, 1))
-        pose[:, :3, :3] = matrix @ _rotation_matrices(self._randomized["cam_quat"][which, self._camera])
-        pose[:, :3, 3] = qpos[:, :3] + (matrix @ self._randomized["cam_pos"][which, self._camera, :, None])[..., 0]
-        return opencv_to_mujoco(pose), time
+        base = _rotation_matrices(qpos[:, 3:])
+        rotation = base @ _rotation_matrices(self._randomized["cam_quat"][which, self._camera])
+        position = qpos[:, :3] + (base @ self._randomized["cam_pos"][which, self._camera, :, None])[..., 0]
+        return opencv_to_mujoco(pose_of(rotation, position)), time
 
     def sync(self, which: Indices) -> None:
         """Updates the `MjData` of some environments to their present state."""

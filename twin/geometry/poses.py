@@ -7,6 +7,7 @@ A *pose* is a 4×4 matrix that maps homogeneous points from one frame to another
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from twin.types import Array
 
@@ -53,6 +54,13 @@ def umeyama(source: Array, target: Array, with_scale: bool = True) -> Similarity
     return Similarity(scale, rotation, mean_target - scale * rotation @ mean_source)
 
 
+def pose_of(rotation: NDArray, position: NDArray) -> Array:
+    """The pose (..., 4, 4) with a rotation (..., 3, 3) and a position (..., 3)."""
+    pose = np.zeros((*np.shape(position)[:-1], 4, 4))
+    pose[..., :3, :3], pose[..., :3, 3], pose[..., 3, 3] = rotation, position, 1.0
+    return pose
+
+
 def inverse_pose(pose: Array) -> Array:
     """Inverse of rigid transforms, shape (..., 4, 4)."""
     out = np.zeros_like(pose)
@@ -87,7 +95,4 @@ def look_at(eye: Array, target: Array) -> Array:
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
-    pose[:3, 3] = eye
-    return pose
+    return pose_of(np.stack([right, np.cross(forward, right), forward], 1), eye)

@@ -26,6 +26,7 @@ from twin.files import load_arrays
 from twin.geometry.cameras import Cameras, depth_determined, opencv_to_mujoco, project
 from twin.geometry.images import read_image, write_image
 from twin.geometry.polyline import arc_lengths, corridor_edges, heading_at, point_at, total_turn
+from twin.geometry.poses import pose_of
 from twin.geometry.route import BRANCH
 from twin.mjcf import husky
 from twin.mjcf.world import (
@@ -199,9 +200,7 @@ def rest_pose(height_at: Callable[[Array], Array], xy: Array, yaw: float) -> tup
 
 def camera_pose(params: HuskyParams, base: Array, rotation: Array) -> Array:
     """camera_to_world (4, 4), OpenCV axes, of the front camera; position (3,) [m] and axes (3, 3) of the base."""
-    pose = np.eye(4)
-    pose[:3, :3] = rotation @ params.camera_rotation
-    pose[:3, 3] = base + rotation @ params.camera_position
+    pose = pose_of(rotation @ params.camera_rotation, base + rotation @ params.camera_position)
     return opencv_to_mujoco(pose)  # this conversion is its own inverse
 
 

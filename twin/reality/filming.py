@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from twin.files import atomic_path
 from twin.geometry.cameras import evenly_spaced, opencv_to_mujoco, pixel_grid, unproject
 from twin.geometry.mesh_rays import Surface
+from twin.geometry.poses import pose_of
 from twin.reality import SEED, primitives, true_world
 from twin.reality.lighting import Lighting
 from twin.reality.place_objects import DrivenLine, KnownPlace, PlaceObject
@@ -163,11 +164,8 @@ def _pose(position: Array, yaw: float, pitch: float, roll: float) -> Array:
     forward = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)])
     right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
     down = np.cross(forward, right)
-    pose = np.eye(4)
     c, s = np.cos(roll), np.sin(roll)
-    pose[:3, :3] = np.stack([c * right + s * down, -s * right + c * down, forward], 1)
-    pose[:3, 3] = position
-    return pose
+    return pose_of(np.stack([c * right + s * down, -s * right + c * down, forward], 1), position)
 
 
 class Renderer:

@@ -18,6 +18,7 @@ from scipy.special import expit
 
 from twin.errors import InputError
 from twin.geometry.cameras import pixel_grid, unproject
+from twin.geometry.poses import pose_of
 from twin.ranges import Range, setting_ranges
 from twin.reality import SEED
 from twin.reality.filming import FilmingPlan, motion_between, read_rows, smooth_noise
@@ -152,10 +153,8 @@ def camera_to_base(camera: HiddenCamera) -> Array:
     flip = np.diag([1.0, -1.0, -1.0])  # between axes right, up, back and right, down, forward
     angles = (camera.turn_right, camera.turn_up, camera.turn_back)
     turn = Rotation.from_euler("XYZ", angles, degrees=True).as_matrix()
-    out = np.eye(4)
-    out[:3, :3] = nominal @ flip @ turn @ flip
-    out[:3, 3] = np.add(_SEAT, (camera.shift_forward, camera.shift_left, camera.shift_up))
-    return out
+    shift = (camera.shift_forward, camera.shift_left, camera.shift_up)
+    return pose_of(nominal @ flip @ turn @ flip, np.add(_SEAT, shift))
 
 
 # ---- lens, exposure and sensor

@@ -34,6 +34,7 @@ from typing import Annotated
 import numpy as np
 
 from twin.errors import InputError
+from twin.geometry.poses import pose_of
 from twin.ranges import Range, setting_ranges
 from twin.reality import SEED
 from twin.reality.place_objects import KnownPlace, Solids
@@ -436,6 +437,4 @@ class RealRobot:
         turn = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
         nose = np.array([[cp, 0.0, -sp], [0.0, 1.0, 0.0], [sp, 0.0, cp]])
         lean = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
-        out = np.eye(4)
-        out[:3, :3], out[:3, 3] = turn @ nose @ lean, (x, y, z)
-        return out
+        return pose_of(turn @ nose @ lean, np.array([x, y, z]))

@@ -22,6 +22,7 @@ from twin.errors import InputError
 from twin.evaluation.trials import Trial
 from twin.files import atomic_path, remove, require_output
 from twin.geometry.images import write_image
+from twin.geometry.poses import pose_of
 from twin.reality import SEED
 from twin.reality.filming import FilmingPlan, write_video
 from twin.reality.lighting import Lighting, weather, weather_index
@@ -313,11 +314,9 @@ def write_robot_bag(
 def _measured(base_to_world: Array, rng: np.random.Generator) -> Array:
     """A pose of the base (4, 4), in the bag's frame of poses and with noise."""
     yaw, x, y = _FRAME
-    frame = np.eye(4)
-    frame[:3, :3], frame[:2, 3] = Rotation.from_euler("z", yaw).as_matrix(), (x, y)
-    noise = np.eye(4)
-    noise[:3, :3] = Rotation.from_euler("z", rng.normal(0.0, _FIX_YAW_NOISE)).as_matrix()
-    noise[:2, 3] = rng.normal(0.0, _FIX_POSITION_NOISE, 2)
+    frame = pose_of(Rotation.from_euler("z", yaw).as_matrix(), np.array([x, y, 0.0]))
+    turn = Rotation.from_euler("z", rng.normal(0.0, _FIX_YAW_NOISE)).as_matrix()
+    noise = pose_of(turn, np.append(rng.normal(0.0, _FIX_POSITION_NOISE, 2), 0.0))
     return frame @ base_to_world @ noise
 
 

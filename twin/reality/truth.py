@@ -25,7 +25,7 @@ from twin.errors import InputError
 from twin.files import load_arrays, read_json, wrap_read_errors, write_json
 from twin.geometry.cameras import Cameras, Viewpoints, evenly_spaced, pixel_grid, scaled_intrinsics, unproject
 from twin.geometry.mesh_rays import Surface
-from twin.geometry.poses import Similarity, rotation_angle, umeyama
+from twin.geometry.poses import Similarity, pose_of, rotation_angle, umeyama
 from twin.geometry.route import BRANCH
 from twin.nerf.baked import BakedField
 from twin.reality import SEED, campus_road
@@ -171,11 +171,9 @@ class Truth:
         """Interpolated camera_to_world of one source at times within its film [s], shapes (n,) → (n, 4, 4)."""
         film = self.films[source]
         at = np.clip(times, film.times[0], film.times[-1])
-        out = np.tile(np.eye(4), (len(at), 1, 1))
-        out[:, :3, :3] = Slerp(film.times, Rotation.from_matrix(film.camera_to_world[:, :3, :3]))(at).as_matrix()
-        for axis in range(3):
-            out[:, axis, 3] = np.interp(at, film.times, film.camera_to_world[:, axis, 3])
-        return out
+        turns = Slerp(film.times, Rotation.from_matrix(film.camera_to_world[:, :3, :3]))(at).as_matrix()
+        positions = [np.interp(at, film.times, film.camera_to_world[:, axis, 3]) for axis in range(3)]
+        return pose_of(turns, np.stack(positions, 1))
 
 
 def fingerprint(place: KnownPlace) -> list[float]:

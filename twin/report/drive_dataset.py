@@ -28,6 +28,7 @@ from twin.env.episode import Episode
 from twin.errors import InputError
 from twin.evaluation.trial_judge import judge
 from twin.files import new_folder, read_json, require_absent, wrap_read_errors, write_json
+from twin.geometry.poses import pose_of
 from twin.learn.policy import find_policy, load_policy
 from twin.loading import load_scene
 from twin.report.video_writer import VideoWriter, read_frames
@@ -402,10 +403,9 @@ def write_bag_dataset(
                 rewards[-1] = getattr(options.rewards, cause)
             stamps = begin + np.round(trial.times * 1e9).astype(np.int64)
             motion = _motion(recording, stamps)
-            base_to_world = np.tile(np.eye(4), (len(stamps), 1, 1))
-            base_to_world[:, :3, :3] = Rotation.from_euler("z", trial.poses[:, 2:]).as_matrix()
-            base_to_world[:, :2, 3] = trial.poses[:, :2]
-            base_to_world[:, 2, 3] = ground.at(trial.poses[:, :2])
+            xy = trial.poses[:, :2]
+            rotations = Rotation.from_euler("z", trial.poses[:, 2:]).as_matrix()
+            base_to_world = pose_of(rotations, np.column_stack([xy, ground.at(xy)]))
             drives.append(
                 Episode(
                     times=trial.times,

@@ -20,6 +20,7 @@ from twin.env.episode_lighting import EpisodeLighting
 from twin.errors import short_repr
 from twin.files import read_json, wrap_read_errors, write_json
 from twin.geometry.images import to_uint8
+from twin.geometry.poses import pose_of
 from twin.nerf.baked import BakedField
 from twin.nerf.lightings import mixed_fog
 from twin.nerf.sun import mixed_sunlight
@@ -85,9 +86,8 @@ class CameraPath:
         # A cubic spline overshoots where the camera stands still. In this case, and for two views, PCHIP is used.
         still = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).min() < 1e-6
         curve = PchipInterpolator if still or len(knots) == 2 else CubicSpline
-        out = np.tile(np.eye(4), (len(t), 1, 1))
-        out[:, :3, 3] = curve(knots, poses[:, :3, 3])(t)
-        out[:, :3, :3] = RotationSpline(knots, Rotation.from_matrix(poses[:, :3, :3]))(t).as_matrix()
+        turns = RotationSpline(knots, Rotation.from_matrix(poses[:, :3, :3]))(t).as_matrix()
+        out = pose_of(turns, curve(knots, poses[:, :3, 3])(t))
         fov = np.interp(t, knots, [view.fov for view in self.views])
         before = np.clip(np.searchsorted(knots, t, "right") - 1, 0, len(knots) - 2)
         share = (t - knots[before]) / (knots[before + 1] - knots[before])

@@ -17,6 +17,7 @@ import viser
 from twin.env.episode_lighting import EpisodeLighting
 from twin.errors import InputError
 from twin.geometry.cameras import Cameras
+from twin.geometry.poses import pose_of
 from twin.loading import Twin
 from twin.nerf.baked import BakedField
 from twin.types import Array
@@ -179,7 +180,4 @@ class Viewer:
 
 def camera_pose_of(client: viser.ClientHandle) -> Array:
     """camera_to_world of a page's camera, OpenCV axes, shape (4, 4)."""
-    pose = np.eye(4)
-    pose[:3, :3] = viser.transforms.SO3(client.camera.wxyz).as_matrix()
-    pose[:3, 3] = client.camera.position
-    return pose
+    return pose_of(viser.transforms.SO3(client.camera.wxyz).as_matrix(), client.camera.position)
