@@ -235,7 +235,7 @@ class _ShortCut:
         self._ahead = rng.uniform(1.0, 12.0)
 
     def command(self, pose: Array) -> tuple[float, float]:
-        foot, _ = nearest_on_route(self._route, pose[:2], (self._s - 1.0, self._s + 3.0))
+        foot, _ = nearest_on_route(self._route, pose[:2], self._s)
         self._s = max(self._s, float(foot))
         return _toward(pose, point_at(self._route, self._s + self._ahead))
 

@@ -445,10 +445,10 @@ def test_left_of_the_route_is_positive():
     s, error = nearest_on_route(route, np.array([[5.0, 1.0], [5.0, -1.0], [9.0, 5.0]]))
     np.testing.assert_allclose(s, [5.0, 5.0, 15.0])
     np.testing.assert_allclose(error, [1.0, -1.0, 1.0])
-    # On a route that meets itself, only the given range is searched.
+    # On a route that meets itself, only the surroundings of the previous point are searched.
     loop = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0], [0.0, 0.1]])
     assert nearest_on_route(loop, np.array([0.02, 0.2]))[0] == pytest.approx(15.8)
-    assert nearest_on_route(loop, np.array([0.02, 0.2]), around=(0.0, 2.0))[0] == pytest.approx(0.02)
+    assert nearest_on_route(loop, np.array([0.02, 0.2]), last=0.0)[0] == pytest.approx(0.02)
 
 
 def test_headings_turns_and_corridor_edges_equal_closed_forms():
@@ -470,14 +470,14 @@ def test_tiny_world_is_a_drivable_model(tmp_path):
 
 
 def test_projection_is_vectorized():
-    """The route has uneven segments and meets itself; each point has its own range."""
+    """The route has uneven segments and meets itself; each point has its own previous point."""
     rng = np.random.default_rng(0)
     angle = np.sort(rng.uniform(0.0, 4.0 * np.pi, 160))
     route = np.stack([3.0 * np.sin(angle), 2.0 * np.sin(2.0 * angle)], -1)  # an eight, twice around
     middle = rng.uniform(0.0, arc_lengths(route)[-1], 50)
-    low, high = middle - rng.uniform(0.0, 1.0, 50), middle + rng.uniform(0.0, 3.0, 50)
+    last = middle + rng.uniform(-2.0, 0.5, 50)
     points = point_at(route, middle) + rng.normal(scale=0.5, size=(50, 2))
-    together = np.stack(nearest_on_route(route, points, (low, high)), -1)
-    alone = [nearest_on_route(route, points[i], (low[i], high[i])) for i in range(50)]
+    together = np.stack(nearest_on_route(route, points, last), -1)
+    alone = [nearest_on_route(route, points[i], last[i]) for i in range(50)]
     np.testing.assert_array_equal(together, alone)
     assert (np.abs(together[:, 0] - nearest_on_route(route, points)[0]) > 1.0).any()  # elsewhere it is nearer still

@@ -41,7 +41,6 @@ _LOOKAHEAD = 1.0  # [m] distance along the route to the point that the robot ste
 _GAIN_RATE = 0.15  # fraction of the gain's error that is corrected per control step
 _GAIN_RANGE = (0.5, 2.5)
 _GAIN_MIN_YAW_RATE = 0.15  # [rad/s]; at smaller yaw rates, the measured ratio is mostly noise
-_SEARCH_WINDOW = (1.0, 3.0)  # [m] the nearest point is searched this far behind and ahead of the farthest one so far
 
 
 @dataclass(frozen=True)
@@ -106,7 +105,7 @@ class PurePursuit:
 
     def update(self, pose: Array) -> tuple[float, float]:
         """Updates `s` from a pose (x, y, yaw); returns the foot's arc length and the cross-track error [m]."""
-        foot, error = nearest_on_route(self._route, pose[:2], (self.s - _SEARCH_WINDOW[0], self.s + _SEARCH_WINDOW[1]))
+        foot, error = nearest_on_route(self._route, pose[:2], self.s)
         self.s = max(self.s, float(foot))
         return float(foot), float(error)
 

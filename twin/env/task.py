@@ -54,7 +54,6 @@ EnvIndices = Sequence[int] | NDArray[np.int64]
 
 _CODES = {cause: code for code, cause in enumerate(CAUSES, 1)}  # 0: the episode goes on
 BUMPER_OFFSET = 0.5  # [m] from the base to the bumper; the goal is reached when the bumper is at the segment's end
-_SEARCH_WINDOW = (1.0, 3.0)  # [m] the nearest point of the route is searched this far behind and ahead of the last one
 ROLLOVER_COSINE = 0.5  # cosine of the tilt beyond which the robot has rolled over
 STUCK_TIME, STUCK_DISTANCE = 5.0, 0.1  # [s], [m]: a robot that moves less than this distance in this time is stuck
 _STATE_MARGIN = 10.0  # bounds of speed and yaw rate in the state, as multiples of the controller's limits
@@ -210,7 +209,7 @@ class RewardAndTermination:
         return far, 0.0, 0.0
 
     def _nearest(self, position: Array, foot: Array) -> tuple[Array, Array]:
-        return nearest_on_route(self._route, position, (foot - _SEARCH_WINDOW[0], foot + _SEARCH_WINDOW[1]))
+        return nearest_on_route(self._route, position, foot)
 
 
 # ---- physics and task of one drive

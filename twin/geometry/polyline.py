@@ -8,6 +8,7 @@ import numpy as np
 
 from twin.types import Array
 
+_SEARCH_WINDOW = (1.0, 3.0)  # [m] the nearest point is searched this far behind and ahead of the previous one
 _CHORD = 1.0  # [m] length of the chord whose direction is the heading of a route
 
 
@@ -35,20 +36,18 @@ def heading_at(route: Array, s: Array | float) -> Array:
     return np.arctan2(chord[..., 1], chord[..., 0])
 
 
-def nearest_on_route(
-    route: Array, xy: Array, around: tuple[Array | float, Array | float] | None = None
-) -> tuple[Array, Array]:
+def nearest_on_route(route: Array, xy: Array, last: Array | float | None = None) -> tuple[Array, Array]:
     """Arc lengths of the points of the route nearest to `xy`, and cross-track errors [m], both of shape (...).
 
     Args:
         route: Shape (m, ≥2).
         xy: Shape (..., 2) [m].
-        around: Lowest and highest arc length to search [m], each a number or of shape (...), for a route that crosses
-            itself; the whole route by default.
+        last: Arc lengths of the previous nearest points [m], a number or of shape (...). Only the route around them is
+            searched (`_SEARCH_WINDOW`), since it may cross itself; the whole route by default.
     """
     knots, xy = arc_lengths(route), np.asarray(xy)
-    low, high = (knots[0], knots[-1]) if around is None else around
-    # Indices of the segments that overlap each range of `around`, padded to the largest number of segments in a range.
+    low, high = (knots[0], knots[-1]) if last is None else (last - _SEARCH_WINDOW[0], last + _SEARCH_WINDOW[1])
+    # Indices of the segments that overlap each range, padded to the largest number of segments in a range.
     first = np.broadcast_to(np.searchsorted(knots[1:], low), xy.shape[:-1])
     last = np.broadcast_to(np.searchsorted(knots[:-1], high, "right"), xy.shape[:-1])
     run = first[..., None] + np.arange(np.max(last - first, initial=1))
