@@ -175,11 +175,69 @@ def test_a_lighting_compared_with_more_days_counts_more_for_policies_not_driven_
     real = [Cell(f"p{i}", "straight", d, 50, won[of][i], of) for i in range(7) for d, of in days.items()]
     made = make_forecast("road", twin, real)
     new = next(c for c in made.candidates if c.policy == "new")
-    assert new.twin.value == pytest.approx(0.5) and new.corrected.value == pytest.approx((3 * 34 + 16) / 200)
+    assert new.twin.value == new.corrected.value == pytest.approx((3 * 34 + 16) / 200)
     over_days = [(3 * won["sun"][i] + won["night"][i]) / 200 for i in range(7)]
     twin_only = [over_days[3]] * 2
     expected = prediction_powered_mean(twin=over_days, real=over_days, twin_only=twin_only).value
     assert made.groups[0].mean_real.value == pytest.approx(expected)
+
+
+def test_the_table_and_the_verdict_agree_on_the_twins_best_policy() -> None:
+    """Three days are compared with held-out lightings, one with its photo: each day counts once, in ranks, too."""
+    twin = [Cell("a", "straight", "held-out", 40, 36), Cell("a", "straight", "photo", 40, 4)]
+    twin += [Cell("b", "straight", light, 40, 24) for light in ("held-out", "photo")]
+    days = {"monday": "held-out", "tuesday": "held-out", "friday": "held-out", "sunday": "photo"}
+    real = [Cell(p, "straight", day, 20, won, of) for day, of in days.items() for p, won in (("a", 6), ("b", 12))]
+    first, second = make_forecast("road", twin, real).candidates
+    assert (first.policy, first.twin.value, second.twin.value) == ("a", pytest.approx(0.7), pytest.approx(0.6))
+    assert first.twin_ranks[0] > 0.5
+    # The interval knows that only two lightings were seen, although one counts three times.
+    two = RateModel.fit(np.array([[36, 4], [24, 24]]), np.full((2, 2), 40), road=False).interval()
+    assert (first.twin.low, first.twin.high) == (pytest.approx(two[0][0]), pytest.approx(max(two[1][0], 0.7)))
+
+
+def two_tasks(hard: tuple[float, ...]) -> tuple[list[Cell], list[Cell]]:
+    """Cells of 20 trials of a policy, six policies on four days: all pass the easy task, the hard one as given."""
+    twin, real = [], []
+    for task, rates in (("easy", (0.9, 0.8, 0.85, 0.95, 1.0, 0.75)), ("hard", (0.3, 0.25, 0.2, 0.15, 0.1, 0.05))):
+        order = rates if task == "easy" else hard
+        for i in range(6):
+            for day in "abcd":
+                twin.append(Cell(f"p{i}", task, day, 20, round(20 * rates[i])))
+                real.append(Cell(f"p{i}", task, day, 20, round(20 * order[i])))
+    return twin, real
+
+
+def test_the_headline_is_of_the_task_that_the_twin_ranks_worst() -> None:
+    """With the hard task's order reversed, ranks of both tasks together still look fair."""
+    made = make_forecast("road", *two_tasks((0.05, 0.1, 0.15, 0.2, 0.25, 0.3)))
+    assert made.groups[-1].spearman.value > 0.6 and made.groups[1].spearman.value == pytest.approx(-1.0)
+    (verdict,) = [v.text for v in verdicts(made) if "Spearman" in v.text]
+    assert "does not rank" in verdict and "on hard, the task on which it ranks worst" in verdict
+    assert "on the road does: Spearman" not in " ".join(v.text for v in verdicts(made) if v.mood == "good")
+
+
+def test_the_baseline_without_the_twin_knows_how_hard_a_task_is() -> None:
+    twin, real = two_tasks((0.3, 0.25, 0.2, 0.15, 0.1, 0.05))
+    everywhere = make_forecast("road", twin, real).groups[-1]
+    baseline = next(one.log.value for one in everywhere.scores if one.predictor == OTHERS)
+    each = [
+        next(one.log.value for one in g.scores if one.predictor == OTHERS)
+        for g in make_forecast("road", twin, real).groups[:2]
+    ]
+    assert baseline == pytest.approx(np.mean(each), rel=0.1) and baseline < 0.6
+
+
+def test_a_task_with_too_few_trials_leaves_the_verdicts_on_the_others() -> None:
+    twin, real = two_tasks((0.3, 0.25, 0.2, 0.15, 0.1, 0.05))
+    real = [
+        replace(c, trials=3, successes=1) if (c.policy, c.task, c.lighting) == ("p0", "hard", "a") else c for c in real
+    ]
+    made = make_forecast("road", twin, real)
+    assert [g.task for g in made.groups] == ["easy", "hard"]
+    said = [v.text for v in verdicts(made)]
+    assert "Spearman" in said[1] and "on easy" in said[1]
+    assert said[-1].startswith("Too few real trials to say how well the twin predicts hard: each cell needs 5 trials")
 
 
 def test_a_group_of_all_tasks_combines_those_of_the_tasks() -> None:

@@ -116,6 +116,10 @@ def test_results_find_their_cell(tmp_path: Path) -> None:
         ),
         (HEADER + "nerf,sunn,10,5\n", "line 2: lighting 'sunn' is not in the twin; did you mean 'sun'?"),
         (HEADER + "nerf,dusk,10,5\n", "expected one of held-out, sun; or add a column twin_lighting"),
+        (
+            DAYS + "nerf,dusk,10,5,sun\nvaried,dusk,10,5,dawn+randomised\n",
+            "results.csv line 2; policies are compared under one lighting of the twin: give the same in all rows",
+        ),
         (HEADER + "nerf,night,10,5\n", "policy 'nerf' was not validated under 'night'; run twin validate"),
         (HEADER + "simulator,sun,10,5\n", "was validated on straight and right_turn; add a column task"),
         (HEADER + "nerf,sun,10,5\nnerf,sun,10,6\n", "results.csv line 2, too; if these"),

@@ -313,7 +313,10 @@ def _probabilities(data: PairedCells, real: Sequence[Cell], twin: Cells) -> dict
     probability, several = _twin_probabilities(data, real, twin)
     logs = {TWIN: log_score(probability, data.real)}
     briers = {TWIN: brier(probability, data.real)}
-    others = np.broadcast_to(other_trainings(data, np.zeros(data.policies, int))[:, None], probability.shape)
+    task = np.empty(data.policies, int)
+    for k, members in enumerate(data.strata):
+        task[members] = k
+    others = np.broadcast_to(other_trainings(data, task)[:, None], probability.shape)
     for name, p in ((RECALIBRATED, recalibrated(probability, data)), (OTHERS, others)):
         if data.trainings > 1:
             logs[name], briers[name] = log_score(p, data.real), brier(p, data.real)

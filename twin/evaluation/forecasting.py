@@ -1,10 +1,11 @@
 """Forecast of real success rates from rates in the twin. `report/` makes pages and tables from these numbers.
 
 A *candidate* is a policy on a task. Its twin score is the mean of its success rates in the twin under the *compared
-lightings*: those with which the task's real trials are compared, or all lightings if there are no real trials. A
-candidate is *driven* if it has real trials. A *day* is a lighting of the real trials; a *training* is a run, with all
-its checkpoints. `rate_model.py` gives the intervals of driven candidates, `statistics.LinearCorrection` predicts the
-rates of the others. `agreement` compares the driven candidates of one task, or of all tasks, with the twin.
+lightings*: those with which the task's real trials are compared, each as often as days are compared with it, or all
+lightings if there are no real trials. A candidate is *driven* if it has real trials. A *day* is a lighting of the real
+trials; a *training* is a run, with all its checkpoints. `rate_model.py` gives the intervals of driven candidates,
+`statistics.LinearCorrection` predicts the rates of the others. `agreement` compares the driven candidates of one task,
+or of all tasks, with the twin.
 """
 
 from collections import Counter
@@ -204,12 +205,13 @@ def make_forecast(
             days = _days_by_lighting(task_real)
             task_further = [_score_over_days(row, days) for row in rows]
             groups.append(measure_agreement(task, task_real, found, task_further))
-            further += task_further
+            further += [] if groups[-1].missing else task_further
             left_out += _left_out(task, task_real, found)
         allocations.append(_allocation(task, [c for c in task_twin if c.lighting in lightings], task_real, seed))
         candidates += [replace(c, trained=(trained or {}).get((c.policy, task), c.trained)) for c in task_candidates]
-    if len(groups) > 1:
-        groups.append(measure_agreement(ALL_TASKS, real, found, further))
+    measured = [group.task for group in groups if not group.missing]
+    if len(measured) > 1:
+        groups.append(measure_agreement(ALL_TASKS, [cell for cell in real if cell.task in measured], found, further))
     return Forecast(
         scene=scene,
         twin_trials=sum(cell.trials for cell in twin),
@@ -230,11 +232,23 @@ def _days_by_lighting(real: Sequence[Cell]) -> Counter[str]:
 
 
 def _score_over_days(cells: Sequence[Cell], days: Counter[str]) -> float:
-    """Mean twin rate over real days of a policy without real trials; `cells` has one cell per compared lighting.
+    """Mean twin rate over real days of a policy with one cell per lighting.
 
-    As in the scores of the driven policies, a lighting with which three days are compared counts three times.
+    A lighting with which three days are compared counts three times; one with which no day is compared counts once.
     """
-    return float(np.average([c.rate for c in cells], weights=[days[c.lighting] for c in cells]))
+    return float(np.average([c.rate for c in cells], weights=[max(1, days[c.lighting]) for c in cells]))
+
+
+def _one_per_day(cells: Sequence[Cell], days: Counter[str]) -> list[Cell]:
+    """Splits the trials of a lighting into as many cells as days are compared with it, see `_score_over_days`."""
+    out = []
+    for cell in cells:
+        n = min(max(1, days[cell.lighting]), cell.trials)
+        parts = np.arange(n + 1)
+        won = np.diff(cell.successes * parts // n)
+        lost = np.diff((cell.trials - cell.successes) * parts // n)[::-1]
+        out += [replace(cell, trials=int(w + f), successes=int(w)) for w, f in zip(won, lost, strict=True)]
+    return out
 
 
 def _candidates(
@@ -251,15 +265,16 @@ def _candidates(
     cells = [[c for c in mine if c.lighting in lightings] or mine for mine in each]
     driven = [[c for c in real if c.policy == p] for p in policies]
     rng = np.random.default_rng([seed, 1])
-    by_day = bool(real) and len(lightings) > 1
-    ranks = rank_probabilities(_sampled_rates(cells, by_day, rng, road=False))
+    by_day, days = bool(real) and len(lightings) > 1, _days_by_lighting(real)
+    units = [_one_per_day(mine, days) for mine in cells] if by_day else cells
+    ranks = rank_probabilities(_sampled_rates(units, by_day, rng, road=False))
     with_real = [i for i, mine in enumerate(driven) if mine]
     real_ranks: dict[int, Array] = {}
     if len(with_real) > 1:
         sampled = _sampled_rates([driven[i] for i in with_real], True, rng)
         real_ranks = dict(zip(with_real, rank_probabilities(sampled), strict=True))
-    twin_rates = _rates_over_days(cells, road=False) if by_day else [_mean_rate(mine) for mine in cells]
-    real_rates = dict(zip(with_real, _rates_over_days([driven[i] for i in with_real]), strict=True))
+    twin_rates = _rates_over_days(cells, days, road=False) if by_day else [_mean_rate(mine) for mine in cells]
+    real_rates = dict(zip(with_real, _rates_over_days([driven[i] for i in with_real], Counter()), strict=True))
     corrected = _corrected(cells, driven, lightings, {cell.key: cell for cell in twin})
     out = [
         Candidate(
@@ -327,18 +342,18 @@ def _sampled_rates(rows: Sequence[Sequence[Cell]], by_day: bool, rng: np.random.
     return RateModel.fit(*unit_counts(rows, by_day), road=road, shared_days=False).sample(rng, SAMPLES)
 
 
-def _rates_over_days(rows: Sequence[Sequence[Cell]], road: bool = True) -> list[Estimate]:
-    """Mean rate of each policy's cells, with an interval over days, on the road or in the twin.
+def _rates_over_days(rows: Sequence[Sequence[Cell]], days: Counter[str], road: bool = True) -> list[Estimate]:
+    """Mean rate of each policy's cells over the days, see `_score_over_days`, with an interval over days.
 
-    The model shrinks a policy's rate towards those of the others, and its rates end short of 0 and 1. So the mean may
-    lie outside the model's interval, which then is widened up to the mean.
+    The model counts each cell once, shrinks a policy's rate towards those of the others, and its rates end short of 0
+    and 1. So the mean may lie outside the model's interval, which then is widened up to the mean.
     """
     if not rows:
         return []
     low, high = RateModel.fit(*unit_counts(rows, True), road=road).interval()
     out = []
     for i, row in enumerate(rows):
-        value, trials = float(np.mean([c.rate for c in row])), sum(c.trials for c in row)
+        value, trials = _score_over_days(row, days), sum(c.trials for c in row)
         if len(row) < MIN_RATE_DAYS:
             few = f"too few for an interval: {len(row)} day, {MIN_RATE_DAYS} are needed"
             out.append(Estimate(value, n=trials, no_interval=few))
@@ -396,6 +411,8 @@ def _allocation(task: str, twin: Sequence[Cell], real: Sequence[Cell], seed: int
         return TrialAllocation(task, len(policies), basis, None, None, 0, 0)
     rows = [[c for c in cells if c.policy == policy] for policy in policies]
     by_day = on_road or (bool(real) and len({c.lighting for c in twin}) > 1)  # as in `_candidates`
+    if by_day and not on_road:
+        rows = [_one_per_day(row, _days_by_lighting(real)) for row in rows]
     rates = _sampled_rates(rows, by_day, np.random.default_rng([seed, 3]), on_road)
     now = expected_confidence(rates, 0, seed, on_road)
     more = [trials_needed(rates, what, seed, on_road) for what in ("winner", "order")]

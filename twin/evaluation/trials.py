@@ -156,8 +156,12 @@ def read_real_trials(table: Path, out: Path) -> list[Trial]:
 
 
 def recorded_twin_lighting(out: Path, cell: tuple[str, str, str]) -> str | None:
-    """The twin's lighting with which the results table `out` compares a cell (policy, task, lighting), if it has it."""
-    _, row = _recorded(out).get(cell, ("", {}))
+    """The twin's lighting with which the results table `out` compares a cell (policy, task, lighting).
+
+    It is that of another policy on the same task and day if the table does not have the cell; None if it has neither.
+    """
+    rows = {key: row for key, (_, row) in _recorded(out).items() if key[1:] == cell[1:]}
+    row = rows.get(cell) or next(iter(rows.values()), {})
     return row.get("twin_lighting") or row.get("lighting")
 
 
@@ -169,8 +173,8 @@ def check_twin_lighting(out: Path, cell: tuple[str, str, str], wanted: str | Non
     recorded = recorded_twin_lighting(out, cell)
     if recorded and wanted and recorded != wanted:
         raise InputError(
-            f"{out}: trials of {cell[0]} under {cell[2]} are compared with {recorded!r}, not with {wanted!r}; give "
-            f"--twin-lighting {recorded}, or change the column twin_lighting of that row"
+            f"{out}: trials under {cell[2]} are compared with {recorded!r}, not with {wanted!r}; give "
+            f"--twin-lighting {recorded}, or change the column twin_lighting in all rows of {cell[2]}"
         )
     return recorded or wanted
 
@@ -246,7 +250,7 @@ def read_results(paths: Sequence[Path], twin: Sequence[Cell]) -> list[Cell]:
     """Reads results tables and checks that the twin has a cell to compare with each real cell.
 
     Raises InputError: no such file, a wrong header, or a line with an unknown name or an impossible count, or a line
-    that repeats another one of any of the tables.
+    that repeats another one of any of the tables or compares a day with another lighting of the twin.
     """
     for path in paths:
         if not path.exists():
@@ -254,6 +258,7 @@ def read_results(paths: Sequence[Path], twin: Sequence[Cell]) -> list[Cell]:
     cells: dict[tuple[str, str, str], Cell] = {}
     places: dict[tuple[str, str, str], str] = {}  # cell key → file and line
     known, spelled = {cell.key for cell in twin}, dict[str, tuple[str, str]]()
+    compared: dict[tuple[str, str], tuple[str, str]] = {}  # task and day → the twin's lighting, file and line
     for where, row in chain.from_iterable(_rows(path, RESULT_COLUMNS, OPTIONAL_RESULT_COLUMNS) for path in paths):
         policy, task = _policy_and_task(where, row, twin)
         trials, successes = _parse_int(where, row, "trials"), _parse_int(where, row, "successes")
@@ -268,6 +273,12 @@ def read_results(paths: Sequence[Path], twin: Sequence[Cell]) -> list[Cell]:
             raise InputError(
                 f"{where}: policy {policy!r}, lighting {cell.lighting!r}, task {task!r} is in {places[cell.key]}, too; "
                 "if these are other trials, replace the two lines by one with their sums, else delete one"
+            )
+        lighting, first = compared.setdefault((task, cell.lighting), (cell.twin_key[2], where))
+        if lighting != cell.twin_key[2]:
+            raise InputError(
+                f"{where}: {cell.lighting!r} is compared with {cell.twin_key[2]!r}, but with {lighting!r} in {first}; "
+                "policies are compared under one lighting of the twin: give the same in all rows of a day"
             )
         # A forecast counts days by their names, so a day written in two ways would make intervals too narrow.
         alike, place = spelled.setdefault(_spelling(cell.lighting), (cell.lighting, where))

@@ -5,6 +5,7 @@ come from `twin.evaluation.forecasting`.
 """
 
 import textwrap
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -111,11 +112,23 @@ def verdicts(forecast: Forecast) -> list[Verdict]:
     leaders = [_leader(forecast, task) for task in forecast.tasks]
     if not forecast.groups:
         return [Verdict("Nothing is known yet about the road: no real trials were given.", "mixed"), *leaders]
-    group = forecast.groups[-1]  # the group of all tasks, or of the only task
-    if group.missing:
-        first = f"Too few real trials to measure how well the twin predicts the road: {group.missing[0]}."
+    measured = [group for group in forecast.groups if not group.missing]
+    if not measured:
+        first = f"Too few real trials to measure how well the twin predicts the road: {forecast.groups[0].missing[0]}."
         return [Verdict(first, "bad"), *leaders]
-    return [believable(group), _agreement(group), *_regret(group), _bias(group), *_skill(group)]
+    group = measured[-1]  # the group of all measured tasks, or of the only one
+    return [
+        believable(group),
+        _agreement(measured),
+        *_regret(group),
+        _bias(group),
+        *_skill(group),
+        *(
+            Verdict(f"Too few real trials to say how well the twin predicts {other.task}: {other.missing[0]}.", "mixed")
+            for other in forecast.groups
+            if other.missing
+        ),
+    ]
 
 
 def believable(group: Agreement) -> Verdict:
@@ -148,17 +161,21 @@ def believable(group: Agreement) -> Verdict:
     return Verdict(f"{text} ({where}).", "bad")
 
 
-def _agreement(group: Agreement) -> Verdict:
-    rank = group.spearman
-    if rank.value is None:
-        return Verdict(f"The rankings cannot be compared: {rank.missing}.", "bad")
+def _agreement(groups: Sequence[Agreement]) -> Verdict:
+    """Verdict on the ranking in the task in which the twin ranks worst: ranks of all tasks together mostly show that
+    one task is harder than another.
+    """
+    tasks = [group for group in groups if group.task != ALL_TASKS]
+    ranked = [group for group in tasks if group.spearman.value is not None]
+    if not ranked:
+        return Verdict(f"The rankings cannot be compared: {tasks[0].spearman.missing}.", "bad")
+    group = min(ranked, key=lambda one: one.spearman.value or 0.0)
+    rank, correlation = group.spearman, group.spearman.value or 0.0
     how, mood = "does not rank", "bad"
-    if rank.value >= FAIR_CORRELATION:
-        how, mood = ("ranks", "good") if rank.value >= GOOD_CORRELATION else ("roughly ranks", "mixed")
-    what, where = "policies", f"on {group.task}"
-    if group.task == ALL_TASKS:
-        what, where = "pairs of policy and task", "on all tasks together"
-    text = f"The twin {how} these {group.policies} {what} as the road does: Spearman {format_estimate(rank)} {where}."
+    if correlation >= FAIR_CORRELATION:
+        how, mood = ("ranks", "good") if correlation >= GOOD_CORRELATION else ("roughly ranks", "mixed")
+    where = f"on {group.task}, the task on which it ranks worst" if len(ranked) > 1 else f"on {group.task}"
+    text = f"The twin {how} these {group.policies} policies as the road does: Spearman {format_estimate(rank)} {where}."
     if rank.no_interval:
         text = f"{text.removesuffix('.')}; {rank.no_interval}."
     # A high correlation is good news only if its interval contains no poor ones.
