@@ -57,6 +57,7 @@ class Node:
     """rclpy.node.Node, with a clock that a test sets."""
 
     overrides: ClassVar[dict[str, Any]] = {}
+    remapped: ClassVar[dict[str, str]] = {}
 
     def __init__(self, node_name: str) -> None:
         self.name, self.time = node_name, 0
@@ -65,6 +66,7 @@ class Node:
         self.published: list[tuple[str, Any]] = []
         self.subscriptions: dict[str, tuple[type, Any]] = {}
         self.timers: list[tuple[float, Any]] = []
+        self.timer_clocks: list[Any] = []
         self.lines: list[str] = []
 
     def declare_parameter(self, name: str, value: Any = None, descriptor: Any = None) -> Any:
@@ -91,8 +93,12 @@ class Node:
 
         return SimpleNamespace(publish=publish)
 
-    def create_timer(self, timer_period_sec: float, callback: Any) -> None:
+    def create_timer(self, timer_period_sec: float, callback: Any, *, clock: Any = None) -> None:
         self.timers.append((timer_period_sec, callback))
+        self.timer_clocks.append(clock)
+
+    def resolve_topic_name(self, topic: str) -> str:
+        return self.remapped.get(topic, f"/{topic}")
 
     def get_clock(self) -> Any:
         stamp = message_class("builtin_interfaces/msg/Time")(sec=self.time // 10**9, nanosec=self.time % 10**9)
@@ -107,8 +113,10 @@ class Node:
 
 def install(monkeypatch: Any) -> None:
     """Installs the stand-ins under the real modules' names until the test ends."""
-    modules = {name: ModuleType(name) for name in ("rclpy", "rclpy.node", "rclpy.qos", "rclpy.signals")}
+    modules = {name: ModuleType(name) for name in ("rclpy", "rclpy.clock", "rclpy.node", "rclpy.qos", "rclpy.signals")}
     modules["rclpy.node"].Node = Node
+    modules["rclpy.clock"].ClockType = SimpleNamespace(STEADY_TIME="steady")
+    modules["rclpy.clock"].Clock = lambda *, clock_type: clock_type
     modules["rclpy.qos"].QoSProfile = lambda depth, reliability: SimpleNamespace(depth=depth, reliability=reliability)
     modules["rclpy.qos"].ReliabilityPolicy = SimpleNamespace(BEST_EFFORT=2)
     modules["rclpy.signals"].SignalHandlerOptions = SimpleNamespace(NO=0)

@@ -149,6 +149,19 @@ def test_rounding_keeps_zero_and_stays_within_half_a_step():
         assert len(np.unique(out)) <= 256 / step + 2
 
 
+def decoded(content: bytes) -> bytes:
+    out = np.frombuffer(content, np.uint8).copy()
+    decode_differences(out)
+    return out.tobytes()
+
+
+def test_a_pack_that_could_not_be_unpacked_is_not_written(root, tmp_path, monkeypatch):
+    monkeypatch.setattr("twin.unpack._MAX_FILES", 5)
+    with pytest.raises(InputError, match="files; expected at most 5"):
+        pack(root, tmp_path / "place.twin", ["ahead"])
+    assert not list(tmp_path.glob("place*"))
+
+
 def test_coding_is_undone_exactly():
     rng = np.random.default_rng(1)
     arrays = {
@@ -160,7 +173,7 @@ def test_coding_is_undone_exactly():
     content = to_safetensors(arrays)
     coded = encode_differences(content)
     assert len(coded) == len(content) and coded != content
-    assert decode_differences(coded) == content
+    assert decoded(coded) == content
     np.testing.assert_array_equal(load_safetensors(coded)["float"], arrays["float"])
 
 
@@ -170,7 +183,7 @@ def test_coded_arrays_may_not_overlap():
     one = json.loads(content[8 : 8 + length])["a"]
     text = json.dumps({"a": one, "b": one}).encode()
     with pytest.raises(ValueError, match="overlap"):
-        decode_differences(struct.pack("<Q", len(text)) + text + content[8 + length :])
+        decoded(struct.pack("<Q", len(text)) + text + content[8 + length :])
 
 
 def test_the_same_scene_gives_the_same_pack(root, packed, tmp_path):
@@ -457,6 +470,10 @@ def wrong_digest(manifest, _):
     manifest["files"]["scene.toml"]["sha256"] = "0" * 64
 
 
+def code_as_differences(manifest, _):
+    manifest["files"][XML]["coding"] = "differences"
+
+
 FIELD, XML, CAMERAS = "build/3_field/baked.safetensors", "build/5_mjcf/scene.xml", "build/2_metric/cameras.json"
 # To a parser without entities, the document is the entity's text; to one with them, it is what follows.
 ENTITY = b"""<!DOCTYPE m [<!ENTITY a "><mujoco><include file='/a.xml'/></mujoco><!--"> ]><!-- x -->"""
@@ -485,6 +502,9 @@ HOSTILE = {
     "include": (edit(XML, lambda b: b.replace(b"<asset>", b'<include file="/a"/><asset>', 1)), "names a file"),
     "path": (edit(XML, lambda b: b.replace(b'meshdir="assets"', b'meshdir="/etc"', 1)), "names a file"),
     "sky": (edit(XML, lambda b: b.replace(b"<asset>", b'<asset><texture fileback="/a.png"/>', 1)), "names a file"),
+    "namespace": (edit(XML, lambda b: b.replace(b"<asset>", b'<include xmlns="q" file="w"/><asset>', 1)), "has xmlns"),
+    "encoding": (edit(XML, lambda b: b.decode().encode("utf-16")), "scene.xml: no UTF-8 text"),
+    "coding": (code_as_differences, "build/5_mjcf/scene.xml has coding differences; expected plain"),
     "entity": (edit(XML, lambda b: ENTITY + b), "scene.xml has <!DOCTYPE; expected"),
     "masks": (edit(CAMERAS, masks_in("/etc")), "etc' names a file"),
     "masks above": (edit(CAMERAS, masks_in("1_capture/../../../x")), "x' names a file"),

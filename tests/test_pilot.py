@@ -1,6 +1,7 @@
 """The pilot: a bag of an episode gives the environment's stacks and commands bit for bit; faults stop the robot."""
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -133,6 +134,12 @@ def test_a_bag_gives_the_environments_stacks_and_the_policys_commands(episode, t
     assert pilot.counts == {"used": len(stacks)}
     np.testing.assert_array_equal(found, stacks)  # so pictures reach the policy unchanged
     assert given == commands  # bit for bit
+
+
+def test_without_onnx_runtime_the_error_is_one_line(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(ValueError, match="ONNX Runtime is not installed"):
+        OnnxPolicy(tmp_path)
 
 
 def test_a_faster_camera_gives_the_same(episode, tmp_path):

@@ -162,6 +162,82 @@ def test_it_stops_when_pictures_cease_and_is_silent_when_the_switch_is_released(
     assert r.commands() == [(0.0, 0.0)]
 
 
+def test_a_picture_that_stops_the_robot_does_so_at_once(rig):
+    """Not only when the watchdog wakes."""
+    r = rig(deadman=0.0)
+    r.calibrate()
+    r.show()
+    assert len(r.commands()) == 1
+    r.wait(100)
+    r.node._on_image(filled(r.stamped(r.module.Image()), 1))
+    assert len(r.commands()) == 1
+    r.wait(100)
+    wrong = filled(r.stamped(r.module.Image()), 2)
+    wrong.encoding = "mono16x"
+    r.node._on_image(wrong)
+    assert r.commands() == [(0.0, 0.0)]
+    r.node._on_image(wrong)
+    assert r.commands() == []
+
+
+@pytest.mark.skipif(HAS_ROS, reason="rclpy keeps its timers' clocks")
+def test_the_watchdog_has_a_clock_that_is_never_set_back(rig, monkeypatch):
+    assert rig().node.timer_clocks == ["steady", "steady"]
+
+    class Simulated(ros_stand_ins.Node):
+        def get_parameter(self, name):
+            return type("Value", (), {"value": True if name == "use_sim_time" else self.parameters[name]})
+
+    monkeypatch.setattr(ros_stand_ins, "Node", Simulated)
+    assert rig().node.timer_clocks == [None, None]  # simulated time may stand still
+
+
+@pytest.mark.skipif(HAS_ROS, reason="needs a remapping of the command line")
+@pytest.mark.parametrize(
+    ("topic", "rectified"),
+    [
+        ("/camera_0/color/image_rect", True),
+        ("/image_rectified/front", True),
+        ("/direct/image", False),
+        ("/rectory/image", False),
+    ],
+)
+def test_pictures_are_not_rectified_twice(rig, monkeypatch, topic, rectified):
+    monkeypatch.setattr(ros_stand_ins.Node, "remapped", {"image": topic})
+    rig(rectified=True)
+    if rectified:
+        with pytest.raises(ValueError, match=f"rectified = false, but {topic} is named"):
+            rig()
+    else:
+        rig()
+
+
+def test_diagnostics_warn_of_a_slow_camera_and_of_a_missing_one(rig):
+    r = rig(deadman=5.0)
+
+    def told() -> tuple[Any, str]:
+        r.node._diagnose()
+        status = r.published[-1][1].status[0]
+        return status.level, status.message
+
+    levels = r.module.DiagnosticStatus
+    r.wait(10)
+    assert told() == (levels.WARN, "deadman switch is not held; no camera_info, so pictures cannot be rectified")
+    r.calibrate()
+    assert told() == (levels.OK, "deadman switch is not held")
+    r.node.pilot.press()
+    for spacing, level, said in ((140, levels.WARN, "drives by a picture every 0.14 s"), (100, levels.OK, "drives")):
+        for k in range(8):
+            r.wait(spacing)
+            r.show(k)
+        if not HAS_ROS:  # else the clock runs on
+            told_level, message = told()
+            if spacing == 140:
+                assert (told_level, message[: len(said)]) == (level, said)
+            else:
+                assert (told_level, message) == (level, said)
+
+
 def test_plain_twists_and_diagnostics(rig):
     r = rig(stamped=False, deadman=0.0, policy_camera=[20.0, 20.0, 16.0, 9.0])
     r.node._diagnose()

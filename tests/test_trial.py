@@ -109,7 +109,7 @@ def test_a_trial_that_another_policy_drove_gets_a_caution(same):
     figures = {
         "seconds": 3.0,
         "cross_track_max_m": 0.1,
-        "start": {"cross_track_m": 0.0, "heading_deg": 0.0},
+        "start": {"along_m": 0.1 + 2.0 * same, "cross_track_m": 0.0, "heading_deg": 0.0},
         "frame": {"located": 0},
         "replay": {"after_2_s_m": None, "end_m": 0.1, "end_deg": 0.0},
         "pictures": {"lighting": "day", "psnr_median": 30.0, "psnr_matched_median": 31.0, "trust_mean": 1.0},
@@ -117,6 +117,7 @@ def test_a_trial_that_another_policy_drove_gets_a_caution(same):
     }
     text = trial.summary(Trial("first", "ahead", "day", 0, "goal", 3.0, 30), figures)
     assert ("caution: was it first that drove?" in text) == (same < 0.5)
+    assert ("caution: it started +1.9 m along the task" in text) == (same == 0.9)
 
 
 def test_bags_become_a_dataset_with_what_the_robot_saw_and_was_told(place, tmp_path, capsys):
@@ -240,8 +241,12 @@ def test_a_trial_with_a_corrected_name_counts_once(place, tmp_path):
     scene, drives = place
     out = tmp_path / "real.csv"
     bag = bag_of(drives["ahead"], tmp_path / "a")
+    moved = tmp_path / "archive" / bag.name
     for lighting in ("mondy", "monday"):
         trial.evaluate_trial(scene, bag, "ahead", "ahead", lighting, out, "day+randomised", frame="scene")
+        if lighting == "mondy":  # the bag is known wherever it lies
+            moved.parent.mkdir()
+            bag = bag.rename(moved)
     assert [line.split(",")[1:3] for line in out.read_text().splitlines()[1:]] == [["monday", "1"]]
     with pytest.raises(InputError, match=r"are compared with 'day\+randomised', not with 'held-out'"):
         trial.evaluate_trial(scene, bag, "ahead", "ahead", "monday", out, "held-out", frame="scene")

@@ -16,6 +16,7 @@ from twin.evaluation.trials import (
     read_results,
     read_trials,
     tally,
+    trials_so_far,
     write_real_trials,
 )
 
@@ -87,6 +88,10 @@ def test_an_invalid_row_is_named(tmp_path: Path, line: str, message: str) -> Non
 def test_without_validated_trials_the_error_names_the_command(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="twin validate"):
         read_trials(tmp_path / "episodes.csv")
+    header = write(tmp_path, ",".join(EPISODE_COLUMNS) + "\n")
+    with pytest.raises(InputError, match="has a header and no rows; run twin validate again"):
+        read_trials(header)
+    assert trials_so_far(header) == trials_so_far(tmp_path / "episodes.csv") == []
 
 
 def test_results_find_their_cell(tmp_path: Path) -> None:

@@ -111,7 +111,7 @@ def align_camera(target: str, film: Path, topic: str = "") -> "tuple[CameraCalib
     root = _scene_root(target)
     scene = SceneDir(root)
     if not film.is_file() and not is_bag(film):
-        raise InputError(f"{film}: no such film")
+        raise InputError(f"{film}: no such film; expected a video, or a bag with pictures")
     if not scene.config_file.exists():
         raise InputError(f"{target}: a film needs a built scene to be localized in; give the scene's folder")
     by_hand = _scene_robot_table(root)

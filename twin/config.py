@@ -14,6 +14,7 @@ from twin.robot import HuskyParams
 TRAINING, HELD_OUT, ANY = "training", "held-out", "any"
 """Names that stand for a lighting sampled for each episode; see `twin/env/episode_lighting.py`."""
 RESERVED_LIGHTINGS = (TRAINING, HELD_OUT, ANY)
+SAMPLED_LIGHTING = "drawn_"  # names of lightings sampled by a search begin with this
 """Not allowed as names of lightings."""
 RANDOMIZED = "+randomised"
 """Suffix of randomized conditions in tables, see `Condition`; the name of a lighting must not end with it."""

@@ -23,6 +23,7 @@ from twin.config import (
     QUALITIES,
     RANDOMIZED,
     RESERVED_LIGHTINGS,
+    SAMPLED_LIGHTING,
     UPS,
     MetricConfig,
     ObstacleConfig,
@@ -228,7 +229,7 @@ def check_lighting(name: str, what: str) -> None:
         f"{what} = {name!r}: ':', '/' and '{RANDOMIZED}' are reserved; choose a plain name",
     )
     _require(
-        name not in RESERVED_LIGHTINGS,
+        name not in RESERVED_LIGHTINGS and not name.startswith(SAMPLED_LIGHTING),
         f"{what} = {name!r} is reserved for a lighting sampled at random; choose another name, such as morning",
     )
     _check_name(name, what)

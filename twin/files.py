@@ -81,7 +81,7 @@ def read_text(path: Path, most: int = _MAX_TEXT) -> str:
     try:
         return read_bytes(path, most).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: no UTF-8 text ({error.reason} at byte {error.start})") from None
+        raise InputError(f"{path}: no UTF-8 text ({error.reason} at byte {error.start}); save it as UTF-8") from None
 
 
 def read_json(path: Path) -> Any:

@@ -15,7 +15,6 @@ of values, which makes the pack smaller and changes the field.
 import argparse
 import csv
 import io
-import re
 import shlex
 import sys
 import zipfile
@@ -57,7 +56,6 @@ _FINER = 4  # step of features / step of density; density is rounded less becaus
 _VERTEX_STEP = 2  # step of the hash grid's vertices / step of features
 _CHUNK = 1 << 20  # [bytes] written between two updates of the progress bar
 _PACKED = {"metric": ("cameras.json", "cameras.npz"), "field": (BAKED_HEAD, "baked.safetensors")}
-_IS_BAKED = re.compile(r"/baked(_\d+)?\.safetensors$")
 _MESH = ("ground.npz", "parts.npz", "visual.npz")
 _TEXT = """\
 A pack of {name}, made by twin {version}: a MuJoCo simulation of a place, which `twin build` made from films.
@@ -246,7 +244,7 @@ def rounded(values: NDArray[np.uint8], step: float) -> NDArray[np.uint8]:
 
 
 def _write(out: Path, files: dict[str, bytes], head: dict[str, Any]) -> dict[str, Any]:
-    coded = {name: unpack.DIFFERENCES if _IS_BAKED.search(name) else unpack.PLAIN for name in files}
+    coded = {name: unpack.DIFFERENCES if unpack.IS_BAKED.search(name) else unpack.PLAIN for name in files}
     facts = {
         name: {"bytes": len(content), "sha256": unpack.digest(content), "coding": coded[name]}
         for name, content in sorted(files.items())
@@ -291,6 +289,8 @@ def _write(out: Path, files: dict[str, bytes], head: dict[str, Any]) -> dict[str
             with archive.open(entry, "w") as packed:
                 for start in range(0, len(content), _CHUNK):
                     progress.update(packed.write(content[start : start + _CHUNK]))
+        archive.close()
+        unpack.read_manifest(partial)  # nobody could unpack a pack that is refused here
     return manifest
 
 

@@ -69,7 +69,7 @@ def _summary(folder: Path, choice: dict[str, Any], picture: Path) -> list[str]:
         "steps": f"tests stayed below the {asked}; give more --steps",
     }
     lines = [
-        f"{folder}: trained for {choice['steps']:,} steps: {ends[choice['why']]}",
+        f"{folder}: trained for {choice['steps']:,} steps: {ends['reached' if choice['reached'] else choice['why']]}",
         f"The policy of step {chosen['step']:,} is kept. In {trials} fresh episodes ({chosen['condition']}) it arrives "
         f"{won} times (rate {won / trials:.2f}, 90 % interval {low:.2f} to {high:.2f}).",
     ]

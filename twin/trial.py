@@ -25,7 +25,7 @@ from twin.env.env_factory import EnvFactory
 from twin.env.episode_lighting import check_lighting_names
 from twin.errors import InputError
 from twin.evaluation.trial_judge import JudgedTrial, TrialViews, judge, replay, view
-from twin.evaluation.trials import Trial, check_twin_lighting, read_real_trials, write_real_trials
+from twin.evaluation.trials import REAL_CSV, Trial, check_twin_lighting, read_real_trials, write_real_trials
 from twin.files import read_json, wrap_read_errors, write_json
 from twin.geometry.poses import wrap_angle
 from twin.learn.policy import Policy, find_policy, load_policy
@@ -39,11 +39,10 @@ from twin.sysid.trial_recording import FrameFit, PosesFrame, TrialRecording, rea
 from twin.types import Array, Image
 from twin_policy import Limits, Pilot, Rectifier
 
-REAL_CSV = "real.csv"
-"""Name of the results table in the scene's folder."""
 _ANSWER = 300_000_000  # [ns] longest time from a picture to the command that follows from it
 _SAME = 1e-3  # [m/s], [rad/s]; commands that differ by less count as equal
 _OWN = 0.5  # if the policy repeats a smaller share of the commands, another one or a person may have driven
+_START_ALONG = 0.5  # [m] largest distance along the route from the task's start at which no caution is printed
 _START_OFFSET, _START_HEADING = 0.3, 10.0  # [m], [°] largest deviations from the route at a trial's start in the twin
 
 
@@ -127,12 +126,13 @@ def evaluate_trial(
         place = factory.world, half_width, limits, load_ground_and_parts(scene.scene)
         seconds = np.asarray((used - begin) * 1e-9, np.float64)
         title = f"{bag.stem}: {row.policy}, {row.task.replace('_', ' ')}"
-        write_json(folder / "trial.json", figures)
         if before and before != row.cell and any(one.key == (*before, row.seed) for one in known):
             was, now = ", ".join(before), ", ".join(row.cell)
             runtime.log_line(f"this trial was counted as {was}; now it is counted as {now}")
         again = row.key, (*(before or row.cell), row.seed)
         write_real_trials([*(one for one in known if one.key not in again), row], table, out, compared)
+        # After the table, so that a killed command does not forget the cell from which the trial must be taken.
+        write_json(folder / "trial.json", figures)
         write_trial_video(folder / "trial.mp4", trial, replayed, pictures, seconds, views, place, title)
         return row, figures, folder
 
@@ -140,7 +140,8 @@ def evaluate_trial(
 def _folder(root: Path, bag: Path, started: int) -> tuple[Path, tuple[str, str, str] | None]:
     """Folder for the results of a trial that started at a time [ms], and the cell as which its bag was counted before.
 
-    The folder's name ends with this time if another trial, of a bag of the same name, has the usual one.
+    A bag is known by its name and the trial's start, wherever it lies. The folder's name ends with this time if another
+    trial, of a bag of the same name, has the usual one.
     """
     usual = root / "trials" / (bag.name if bag.is_dir() else bag.stem)
     for folder in (usual, usual.with_name(f"{usual.name}_{started}")):
@@ -149,8 +150,7 @@ def _folder(root: Path, bag: Path, started: int) -> tuple[Path, tuple[str, str, 
             return folder, None
         with wrap_read_errors(path, "delete it"):
             old = read_json(path)
-            same = Path(old["bag"]).resolve() == bag.resolve() and old.get("started_ms", started) == started
-            if same:
+            if Path(old["bag"]).name == bag.name and old.get("started_ms", started) == started:
                 return folder, (old["name"], old["task"], old["lighting"])
     return folder, None
 
@@ -224,7 +224,11 @@ def _figures(
         "success": trial.cause == "goal",
         "progress_m": float(trial.progress[-1]),
         "seconds": float(trial.times[-1]),
-        "start": {"cross_track_m": float(trial.cross_track[0]), "heading_deg": float(np.degrees(trial.start_heading))},
+        "start": {
+            "along_m": float(trial.progress[0]),
+            "cross_track_m": float(trial.cross_track[0]),
+            "heading_deg": float(np.degrees(trial.start_heading)),
+        },
         "cross_track_max_m": float(np.abs(trial.cross_track).max()),
         "topics": recording.topics,
         "frame": {
@@ -268,6 +272,11 @@ def summary(row: Trial, figures: dict[str, Any]) -> str:
         lines.append(
             f"caution: it started {start:+.2f} m and {heading:+.0f}° off the route; trials in the twin start within "
             f"{_START_OFFSET:g} m and {_START_HEADING:g}°"
+        )
+    if abs(figures["start"]["along_m"]) > _START_ALONG:
+        lines.append(
+            f"caution: it started {figures['start']['along_m']:+.1f} m along the task, which trials in the twin drive "
+            "from its start"
         )
     if frame["located"]:
         lines.append(

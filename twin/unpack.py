@@ -32,11 +32,22 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
+from numpy.typing import NDArray
 
 from twin import commands, runtime
 from twin.config_file import load_config
 from twin.errors import InputError, short_repr
-from twin.files import digest_file, exists, is_file, parse_json, read_json, remove, require_text, wrap_read_errors
+from twin.files import (
+    digest_file,
+    exists,
+    is_file,
+    parse_json,
+    read_json,
+    read_text,
+    remove,
+    require_text,
+    wrap_read_errors,
+)
 from twin.geometry.cameras import Cameras
 from twin.mjcf.world import SCENE_XML
 from twin.runtime import exclusive_lock
@@ -51,7 +62,7 @@ PLAIN, DIFFERENCES = "plain", "differences"
 STAGES_PACKED = ("metric", "field", "mesh", "mjcf")
 """Build stages of which some files are packed."""
 
-_MAX_FILES = 20_000
+_MAX_FILES = 100_000
 _MAX_FILE = 2 << 30  # [bytes] largest file, unpacked
 MAX_TOTAL = 4 << 30
 """Largest total size of the files, unpacked [bytes]."""
@@ -69,6 +80,8 @@ PLACES = re.compile(
     rf"|runs/{_N}/(checkpoints/{_N}/)?policy\.(json|safetensors|onnx)|policies/{_N}\.(onnx|zip)"
 )
 """Pattern of the names that files of a pack may have."""
+IS_BAKED = re.compile(r"/baked(_\d+)?\.safetensors$")
+"""Pattern of the names of files that are coded by `encode_differences`."""
 _CURE = "fetch it again, or ask its sender for another"
 _NOT_A_PACK = "expected a pack, as twin pack writes it"
 _XML_PATHS = (
@@ -76,7 +89,8 @@ _XML_PATHS = (
     *("fileright", "fileleft", "fileup", "filedown", "filefront", "fileback"),
 )
 _XML_REFUSED = ("include", "plugin", "extension", "model", "attach")  # elements that load other files or code
-_XML_ENTITIES = (b"<!DOCTYPE", b"<!ENTITY")
+# MuJoCo's parser expands no entities and knows no namespaces, so it would read another document than the checks do.
+_XML_MARKS = ("<!DOCTYPE", "<!ENTITY", "xmlns")
 _PARTIAL, _TOKEN = ".partial", 8  # suffix of an unfinished folder, and number of random characters in its name
 _HEADER = 8  # [bytes] size of the number at the start of a safetensors file: the header's length
 
@@ -95,41 +109,49 @@ def encode_differences(content: bytes) -> bytes:
     The values of each channel (the last axis) are stored together, as differences modulo 256 from one value to the
     next, because neighbors are alike. The length does not change. `decode_differences` is the exact inverse.
     """
-    return _recode(content, lambda a: np.diff(np.ascontiguousarray(np.moveaxis(a, -1, 0)).ravel(), prepend=np.uint8(0)))
+    out = np.frombuffer(content, np.uint8).copy()
+    for data, channels in _byte_arrays(out):
+        by_channel = np.ascontiguousarray(data.reshape(-1, channels).T).ravel()
+        data[:] = np.diff(by_channel, prepend=np.uint8(0))
+    return out.tobytes()
 
 
-def decode_differences(content: bytes) -> bytes:
-    """The inverse of `encode_differences`. Raises ValueError for a damaged safetensors file."""
+def decode_differences(content: NDArray[np.uint8]) -> None:
+    """The inverse of `encode_differences`, in place: on the bytes of a file, such as a memory map.
 
-    def decode(a: np.ndarray) -> np.ndarray:
-        moved = np.cumsum(a.ravel(), dtype=np.uint8).reshape(a.shape[-1], *a.shape[:-1])
-        return np.ascontiguousarray(np.moveaxis(moved, 0, -1)).ravel()
+    It needs the memory of the largest array. Raises ValueError for a damaged safetensors file.
+    """
+    for data, channels in _byte_arrays(content):
+        given, decoded, last = data.reshape(channels, -1).copy(), data.reshape(-1, channels), np.uint8(0)
+        for channel, differences in enumerate(given):
+            values = np.cumsum(differences, dtype=np.uint8, out=differences)
+            values += last
+            decoded[:, channel], last = values, values[-1]
 
-    return _recode(content, decode)
 
-
-def _recode(content: bytes, change: Any) -> bytes:
-    (length,) = struct.unpack_from("<Q", content)
+def _byte_arrays(content: NDArray[np.uint8]) -> Iterator[tuple[NDArray[np.uint8], int]]:
+    """Views of the byte arrays with two or more axes in a safetensors file's bytes, and their last axes' lengths."""
+    if len(content) < _HEADER:
+        raise ValueError(f"it has {len(content)} bytes; expected a header")
+    (length,) = struct.unpack("<Q", content[:_HEADER].tobytes())
     if length > len(content) - _HEADER:
         raise ValueError(f"its header has {length:,} bytes, but the file only {len(content):,}")
-    out, start = bytearray(content), _HEADER + length
-    left = len(content) - start
-    for name, tensor in json.loads(content[_HEADER:start]).items():
+    start = _HEADER + length
+    left = size = len(content) - start
+    for name, tensor in json.loads(content[_HEADER:start].tobytes()).items():
         if name == "__metadata__" or tensor["dtype"] != "U8" or len(tensor["shape"]) < 2:
             continue
         first, last = tensor["data_offsets"]
         shape = [int(n) for n in tensor["shape"]]
         left -= last - first  # arrays that overlap would take time without bound
-        inside = 0 <= first <= last <= len(content) - start and left >= 0
+        inside = 0 <= first <= last <= size and left >= 0
         if not inside or min(shape) < 0 or math.prod(shape) != last - first:
             raise ValueError(
                 f"{short_repr(name)}: shape {shape} does not match bytes {first} to {last}, or these overlap others or "
-                f"are not within the {len(content) - start} data bytes"
+                f"are not within the {size} data bytes"
             )
         if last > first:
-            flat = np.frombuffer(content, np.uint8, last - first, start + first)
-            out[start + first : start + last] = change(flat.reshape(shape)).tobytes()
-    return bytes(out)
+            yield content[start + first : start + last], shape[-1]
 
 
 # ---- unpacking
@@ -283,6 +305,8 @@ def _checked_manifest(archive: zipfile.ZipFile, path: Path) -> dict[str, Any]:
         if facts["coding"] not in (PLAIN, DIFFERENCES):
             coding = short_repr(facts["coding"])
             raise InputError(f"{path}: {name} has coding {coding}; expected {PLAIN} or {DIFFERENCES}; {_CURE}")
+        if facts["coding"] == DIFFERENCES and not IS_BAKED.search(name):
+            raise InputError(f"{path}: {name} has coding {DIFFERENCES}; expected {PLAIN}; {_CURE}")
         require_text(facts["sha256"])
         if by_name[name].file_size != size:
             raise InputError(
@@ -319,7 +343,10 @@ def _extract(archive: zipfile.ZipFile, name: str, facts: dict[str, Any], target:
     if left:
         raise ValueError(f"{name} is {left:,} bytes shorter than declared")
     if facts["coding"] == DIFFERENCES:
-        target.write_bytes(decode_differences(target.read_bytes()))
+        mapped = np.memmap(target, np.uint8, "r+")  # so that the content need not be in memory
+        decode_differences(mapped)
+        mapped.flush()
+        del mapped
     if digest_file(target) != facts["sha256"]:
         raise ValueError(f"{name} is not as it was packed")
 
@@ -327,7 +354,9 @@ def _extract(archive: zipfile.ZipFile, name: str, facts: dict[str, Any], target:
 def _check_contents(root: Path, path: Path) -> None:
     """Raises InputError if a file of the scene refers to a file outside it, or if `scene.xml` has entities."""
     scene = SceneDir(root)
+    xml = scene.stage("mjcf") / SCENE_XML
     try:
+        content = read_text(xml) if xml.exists() else ""  # UTF-8, as MuJoCo reads it, whatever encoding it declares
         config = load_config(scene.config_file)
         cameras = Cameras.load(scene.stage("metric"))
         folders = [os.path.relpath(one, scene.build.resolve()) for one in (cameras.images, cameras.masks) if one]
@@ -336,13 +365,10 @@ def _check_contents(root: Path, path: Path) -> None:
     inputs = (one for source in config.source for one in (source.path, source.images, source.mask) if one)
     read = (*folders, *cameras.names, *inputs)
     bad = next((one for one in read if one.startswith("/") or ".." in one.split("/")), None)
-    xml = scene.stage("mjcf") / SCENE_XML
-    if bad is None and xml.exists():
-        content = xml.read_bytes()
-        for mark in _XML_ENTITIES:
-            # MuJoCo's parser does not expand entities, so it would read another document than the one checked here.
+    if bad is None and content:
+        for mark in _XML_MARKS:
             if mark in content:
-                raise InputError(f"{path}: {SCENE_XML} has {mark.decode()}; expected a document without; {_CURE}")
+                raise InputError(f"{path}: {SCENE_XML} has {mark}; expected a document without; {_CURE}")
         with wrap_read_errors(path, _CURE):
             for element in ElementTree.fromstring(content).iter():
                 paths = [element.get(key, "x") for key in _XML_PATHS]

@@ -15,7 +15,7 @@ from typing import Any
 from zlib import crc32
 
 from twin import commands, runtime
-from twin.config import Condition
+from twin.config import SAMPLED_LIGHTING, Condition
 from twin.config_file import load_config
 from twin.env.domain_randomization import condition_options, measured_parameters
 from twin.env.env_factory import fingerprint
@@ -31,6 +31,7 @@ from twin.evaluation.trials import (
     read_trials,
     summarize,
     tally,
+    trials_so_far,
     typical_episode,
     worst_episode,
 )
@@ -68,7 +69,7 @@ class Campaign:
         without it, this machine's worker processes are used."""
         self._scene, self.task, self.path = str(twin.scene.root.resolve()), task, path
         self._sources, self._trust, self._processes, self._ray = sources, trust, processes, ray
-        self._done = {t.key: t for t in _read_table(path)}
+        self._done = {t.key: t for t in trials_so_far(path)}
         self._fresh = True
 
     def drive(self, wanted: Sequence[tuple[str, str, Iterable[int]]], what: str) -> list[Trial]:
@@ -135,7 +136,7 @@ def validate(
     with exclusive_lock(folder.with_name(".validation.lock"), f"policies are being driven for {folder}"):
         _drop_partial_row(folder / "episodes.csv")
         _drop_partial_row(folder / "worst.csv")
-        _check_same(folder, twin, task, (*lightings, *(["drawn_"] if worst else [])), policies)
+        _check_same(folder, twin, task, (*lightings, *([SAMPLED_LIGHTING] if worst else [])), policies)
         how = policies, trust, processes, ray
         todo = Campaign(twin, task, folder / "episodes.csv", *how)
         wanted = [(name, one, lighting_seeds(one, episodes)) for name in policies for one in lightings]
@@ -172,7 +173,7 @@ def _write_results(twin: Twin) -> dict:
 
 def _worst_lightings(path: Path) -> list[dict]:
     """Results of the final episodes, in the worst lighting found: one cell per policy and task with a search."""
-    trials = _read_table(path)
+    trials = trials_so_far(path)
     cells = summarize([t for t in trials if t.seed >= _FINAL_SEED])["cells"]
     return [
         c | {"of": len({t.lighting for t in trials if (t.policy, t.task) == (c["policy"], c["task"])})} for c in cells
@@ -243,7 +244,7 @@ def _search_worst_lighting(search: Campaign, policy: str, episodes: int) -> None
     After each round, the lightings with the worst scores are kept and driven in twice as many further episodes.
     """
     seeds = range(_SEARCH_SEED, _SEARCH_SEED + _SEARCH_EPISODES)
-    candidates = [f"drawn_{k}" for k in range(_SEARCH_LIGHTINGS)]
+    candidates = [f"{SAMPLED_LIGHTING}{k}" for k in range(_SEARCH_LIGHTINGS)]
     trials_by_lighting: dict[str, list[Trial]] = {name: [] for name in candidates}
     while len(candidates) > 1:
         wanted = [(policy, name, seeds) for name in candidates]
@@ -286,7 +287,7 @@ def _check_same(folder: Path, twin: Twin, task: str, lightings: Sequence[str], p
             stored = dict(read_json(path))
             recorded |= {name: dict(stored[name]) for name in recorded if name in stored}
             before = {name: twin.scene.root / require_text(one) for name, one in recorded["sources"].items()}
-    trials = [*_read_table(folder / "episodes.csv"), *_read_table(folder / "worst.csv")]
+    trials = [*trials_so_far(folder / "episodes.csv"), *trials_so_far(folder / "worst.csv")]
     driven = {_road(t.task, t.lighting): (t.task, t.lighting) for t in trials}
     for road, (of, lighting) in (driven | {_road(task, one): (task, one) for one in lightings}).items():
         try:
@@ -321,7 +322,7 @@ def _check_same(folder: Path, twin: Twin, task: str, lightings: Sequence[str], p
 
 def _road(task: str, lighting: str) -> str:
     """Key of a task under a lighting; all sampled lightings have the same key, since they come from the same field."""
-    return f"{task}, {'drawn' if lighting.startswith('drawn_') else lighting}"
+    return f"{task}, {'drawn' if lighting.startswith(SAMPLED_LIGHTING) else lighting}"
 
 
 def _digest(source: str) -> str:
@@ -347,11 +348,6 @@ def _drop_partial_row(path: Path) -> None:
         if not blob.endswith(b"\n"):
             whole = blob[: blob.rfind(b"\n") + 1]
             os.truncate(path, len(whole)) if whole else path.unlink()  # a kill here must not lose the rows
-
-
-def _read_table(path: Path) -> list[Trial]:
-    """The trials in a table; empty if the table is missing or has no rows."""
-    return read_trials(path) if path.exists() and path.read_bytes().count(b"\n") > 1 else []
 
 
 def command(given: argparse.Namespace) -> None:

@@ -32,6 +32,8 @@ from twin.errors import InputError, name_hint
 from twin.evaluation.statistics import rate_summary, wilson
 from twin.files import read_text, wrap_read_errors, write_text
 
+REAL_CSV = "real.csv"
+"""Name of the results table in a scene's folder."""
 EPISODE_COLUMNS = ("policy", "task", "lighting", "seed", "success", "cause", "progress_m", "steps", "trust")
 """Columns of `validation/episodes.csv`; `trust` is the trial's mean trust (`twin.env.trust`), or empty."""
 CELL_COLUMNS = ("policy", "task", "lighting", "trials", "successes", "rate", "low", "high")
@@ -229,7 +231,7 @@ def read_trials(path: Path) -> list[Trial]:
             f"{path} does not exist; drive the policies in the twin first: {_VALIDATE_COMMAND} SCENE --policy RUN"
         )
     trials: dict[tuple[str, str, str, int], Trial] = {}
-    for where, row in _rows(path, EPISODE_COLUMNS, ()):
+    for where, row in _rows(path, EPISODE_COLUMNS, (), f"run {_VALIDATE_COMMAND} again"):
         if row["cause"] not in CAUSES:
             raise InputError(f"{where}: cause = {row['cause']!r}; expected one of {', '.join(CAUSES)}")
         if row["success"] != str(int(row["cause"] == "goal")):
@@ -244,6 +246,11 @@ def read_trials(path: Path) -> list[Trial]:
             raise InputError(f"{where}: seed {key[3]} of this policy, task and lighting is there twice; delete one")
         trials[key] = Trial(*key, row["cause"], progress, steps, trust)
     return list(trials.values())
+
+
+def trials_so_far(path: Path) -> list[Trial]:
+    """The trials in a table; empty if it is missing, or has no rows since its first trial was not written."""
+    return read_trials(path) if path.exists() and path.read_bytes().count(b"\n") > 1 else []
 
 
 def read_results(paths: Sequence[Path], twin: Sequence[Cell]) -> list[Cell]:
@@ -327,7 +334,12 @@ def _name_hint(name: str, valid: Sequence[str]) -> str:
     return f"did you mean {longer[0]!r}?" if longer else name_hint(name, valid)
 
 
-def _rows(path: Path, needed: Sequence[str], optional: Sequence[str]) -> Iterable[tuple[str, dict[str, str]]]:
+def _rows(
+    path: Path,
+    needed: Sequence[str],
+    optional: Sequence[str],
+    if_empty: str = "add one line per policy and lighting",
+) -> Iterable[tuple[str, dict[str, str]]]:
     """Yields for each row its location (file and line), and its fields by column name."""
     reader = csv.reader(io.StringIO(_table_text(path)))
     wanted = ",".join(needed) + "".join(f"[,{name}]" for name in optional)
@@ -367,7 +379,7 @@ def _rows(path: Path, needed: Sequence[str], optional: Sequence[str]) -> Iterabl
     except csv.Error as error:
         raise InputError(f"{path} line {reader.line_num}: {error}; expected comma-separated text") from None
     if not count:
-        raise InputError(f"{path} has a header and no rows; add one line per policy and lighting")
+        raise InputError(f"{path} has a header and no rows; {if_empty}")
 
 
 def _table_text(path: Path) -> str:

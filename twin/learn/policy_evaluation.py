@@ -20,7 +20,7 @@ from multiprocessing import active_children, get_context
 
 import numpy as np
 
-from twin.config import Condition
+from twin.config import SAMPLED_LIGHTING, Condition
 from twin.env.domain_randomization import Ranges, condition_options
 from twin.env.env_factory import EnvFactory
 from twin.env.vector_env import ProcessVectorEnv
@@ -34,7 +34,7 @@ CHUNK = 16
 """Largest number of episodes in a chunk."""
 
 _ENVS = 8  # number of episodes driven in parallel
-_SAMPLED_LIGHTING = re.compile(r"drawn_(\d+)")
+_SAMPLED_LIGHTING = re.compile(rf"{SAMPLED_LIGHTING}(\d+)")
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ def run_chunks(chunks: Sequence[EpisodeChunk], processes: int = 1, fresh: bool =
 def with_sampled_lighting(factory: EnvFactory, number: int) -> EnvFactory:
     """Adds a lighting `drawn_<number>` to the factory's field: sampled from the filmed ones, with `number` as seed."""
     assert factory.field is not None
-    name = f"drawn_{number}"
+    name = f"{SAMPLED_LIGHTING}{number}"
     if name not in factory.field.lightings:
         # Sampled from the filmed lightings only, so that lightings sampled earlier have no effect.
         filmed = factory.field.lightings_by_name.filmed()

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.config import RESERVED_LIGHTINGS
+from twin.config import RESERVED_LIGHTINGS, SAMPLED_LIGHTING
 from twin.errors import InputError, name_hint
 from twin.files import read_json, wrap_read_errors, write_json
 from twin.nerf.sun import Sun, Sunlight, mixed_sunlight
@@ -348,7 +348,7 @@ class AddedLighting:
 def check_new_name(name: str, filmed: tuple[str, ...]) -> None:
     """Raises InputError for a name that is reserved, filmed, or unfit for a file name or a part of a mixture."""
     check_name(name, "--name")
-    if name in RESERVED_LIGHTINGS:
+    if name in RESERVED_LIGHTINGS or name.startswith(SAMPLED_LIGHTING):
         raise InputError(f"--name {name!r}: reserved for random lightings; choose another, such as afternoon")
     if name in filmed:
         raise InputError(f"--name {name!r}: the place was filmed under a lighting of this name; choose another")

@@ -373,7 +373,7 @@ def _next_steps(scene: SceneDir, report: dict[str, Any]) -> list[tuple[str, list
     task = "straight"
     if scene.has_route and task not in scene_tasks(World.load(scene.stage("mjcf"))):
         task = "route"
-    align = "Log five minutes of your robot’s driving, fit the simulated robot to the log, and build again:"
+    align = "Log ten minutes of your robot’s driving, fit the simulated robot to the log, and build again:"
     return [
         *out,
         (align, [command("align", root, "drive.csv"), build]),

@@ -456,8 +456,12 @@ def _actions(recording: "TrialRecording", stamps: NDArray[np.int64], period: flo
 
 
 def _pictures_at(recording: "TrialRecording", rectify: Rectifier, stamps: NDArray[np.int64]) -> list[Image]:
-    """The newest picture (h, w, 3) at each instant. Raises InputError: at an instant there is no recent picture."""
-    newest = np.maximum(0, np.searchsorted(recording.shutter, stamps, side="right") - 1)
+    """The newest picture (h, w, 3) that had arrived at each instant; the first one before any had.
+
+    Raises InputError: at an instant there is no recent picture.
+    """
+    arrived = np.maximum.accumulate(recording.arrival)
+    newest = np.maximum(0, np.searchsorted(arrived, stamps, side="right") - 1)
     ages = np.abs(stamps - recording.shutter[newest]) * 1e-9
     if ages.max() > _MAX_GAP:
         at = float((stamps[ages.argmax()] - stamps[0]) * 1e-9)

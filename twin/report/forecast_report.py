@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from twin.evaluation.agreement import Agreement, CellPair, Estimate
 from twin.evaluation.forecasting import Candidate, Forecast
 from twin.evaluation.statistics import MIN_POLICIES, MIN_TRIALS
+from twin.evaluation.trials import REAL_CSV
 from twin.files import write_text
 from twin.report import forecast_text
 from twin.report.figures import (
@@ -222,7 +223,10 @@ def forecast_page(forecast: Forecast, root: Path = Path("SCENE")) -> str:
         limitations=forecast_text.limitations(forecast),
         next_steps=[
             *((text, []) for text in forecast_text.next_trials(forecast)),
-            ("Add the results to real.csv, and forecast again:", [command("forecast", root, "--real", "real.csv")]),
+            (
+                "Add the results to real.csv, and forecast again:",
+                [command("forecast", root, "--real", root / REAL_CSV)],
+            ),
         ],
         MIN_POLICIES=MIN_POLICIES,
         MIN_TRIALS=MIN_TRIALS,

@@ -14,7 +14,7 @@ from twin.errors import InputError
 from twin.evaluation.forecasting import Candidate, Forecast
 from twin.evaluation.statistics import CONFIDENCE, rate_summary
 from twin.evaluation.training_curves import CHOICE_FILE, validated_digests
-from twin.evaluation.trials import Cell, read_trials, tally
+from twin.evaluation.trials import Cell, tally, trials_so_far
 from twin.files import digest_file, exists, read_json, wrap_read_errors, write_text
 from twin.learn.policy import JSON, Policy, load_policy
 from twin.report.forecast_text import format_estimate
@@ -30,7 +30,7 @@ def write_policy_cards(scene: SceneDir, runs: Iterable[str]) -> list[Path]:
     read, such as one of an earlier version, is left out, and a line says so. Raises InputError if another record is
     damaged.
     """
-    cells = tally(read_trials(scene.episodes_csv)) if exists(scene.episodes_csv) else []
+    cells = tally(trials_so_far(scene.episodes_csv))
     forecast = None
     if exists(scene.forecast / "forecast.json"):
         try:

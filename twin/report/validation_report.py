@@ -12,12 +12,12 @@ from urllib.parse import quote
 import numpy as np
 from matplotlib.figure import Figure
 
-from twin.config import ANY, HELD_OUT, TRAINING, Condition
+from twin.config import ANY, HELD_OUT, SAMPLED_LIGHTING, TRAINING, Condition
 from twin.errors import join_names
 from twin.evaluation.agreement import Estimate
 from twin.evaluation.statistics import MIN_POLICIES, MIN_TRIALS
 from twin.evaluation.training_curves import TestCount, plot_tests, range_text
-from twin.evaluation.trials import Trial, csv_text
+from twin.evaluation.trials import REAL_CSV, Trial, csv_text
 from twin.files import write_text
 from twin.geometry.polyline import point_at
 from twin.mjcf.world import World
@@ -85,8 +85,8 @@ def lighting_text(lighting: str) -> str:
             "distractor objects, and values of the robot parameters that were not identified; the fog varies too, "
             "unless the lighting was fitted to a photo, which then determines the fog"
         )
-    if lighting.startswith("drawn_"):
-        return f"lighting number {lighting[6:]} of those sampled in the search"
+    if lighting.startswith(SAMPLED_LIGHTING):
+        return f"lighting number {lighting.removeprefix(SAMPLED_LIGHTING)} of those sampled in the search"
     if lighting.count(":") == 2:
         a, b, part = lighting.split(":")
         return f"{float(part):.0%} of the way from {a} to {b}"
@@ -170,7 +170,7 @@ def limitations(results: dict[str, Any]) -> list[Caution]:
             f"The result may differ for your robot: under {join_names(drawn)} the robot's parameters are random in "
             "each episode, because those of your robot have not been identified."
         )
-        cure = "log five minutes of driving, run twin align, build again and validate again."
+        cure = "log ten minutes of driving, run twin align, build again and validate again."
         out.append(Caution(what, cure))
     searched = {(w["policy"], w["task"]) for w in results.get("worst", [])}
     if left := dict.fromkeys(c["policy"] for c in cells if (c["policy"], c["task"]) not in searched):
@@ -442,6 +442,6 @@ def _next_steps(results: dict[str, Any], root: Path) -> list[tuple[str, list[str
         ),
         (
             "Forecast how often each policy reaches the goal on the road:",
-            [command("forecast", root, "--real", "real.csv")],
+            [command("forecast", root, "--real", root / REAL_CSV)],
         ),
     ]

@@ -68,6 +68,8 @@ def _read_csv(path: Path) -> dict[str, Array]:
     text = read_text(path, _MAX_BYTES)
     try:
         head, *rows = [row for row in csv.reader(io.StringIO(text, newline="")) if row] or [[]]
+        if len(head) == 1 and (other := next((one for one in ";\t" if one in head[0]), "")):
+            raise InputError(f"{path}: its columns are separated by {other!r}, not by commas; export it again")
         values = np.array([[float(cell) if cell.strip() else np.nan for cell in row] for row in rows])
     except (ValueError, csv.Error) as error:
         raise InputError(f"{path}: not a table of numbers under one line of names: {error}; export it again") from None

@@ -27,7 +27,7 @@ from twin.geometry.images import read_image
 from twin.nerf.baked import BakedField
 from twin.nerf.lightings import added_lightings
 from twin.scene import check_name
-from twin.types import Array
+from twin.types import Array, Image
 from twin.unpack import is_cached
 from twin.view.camera_path import CameraPath, KeyView, named_lighting, path_frames, spaced_times, write_path_film
 from twin.view.layers import clicked_frame
@@ -174,7 +174,7 @@ class FilmPanel:
         """Index of the frame that is compared; None while nothing is compared."""
         self._share, self._placed = 0.5, 0.0
         self._comparing: set[int] = set()  # ids of the pages that show the frame; one that opens later does not
-        self._read_frame = lru_cache(_FRAME_CACHE)(lambda i: read_image(self._cameras.image_path(i)))
+        self._read_frame = lru_cache(_FRAME_CACHE)(self._uncached_frame)
         gui = viewer.server.gui
         gui.add_markdown("Compares a filmed frame with the twin from the same pose; move the line between them.")
         self._compare: Any = gui.add_checkbox("compare", False)
@@ -187,6 +187,12 @@ class FilmPanel:
         viewer.on_update(self._frame, self._changed)
         viewer.on_update(self._source, self._source_changed)
         viewer.on_update(self._divider, self._divider_changed)
+
+    def _uncached_frame(self, index: int) -> Image:
+        path = self._cameras.image_path(index)
+        if not path.exists():
+            raise InputError(f"there is no frame {self._cameras.names[index]}: packs have none; view the built scene")
+        return read_image(path)
 
     def _frames(self, source: str) -> NDArray[np.int64]:
         return np.flatnonzero([name == source for name in self._cameras.sources])
@@ -234,9 +240,13 @@ class FilmPanel:
         cameras, frames = self._cameras, self._frames(self._source.value)
         index = int(frames[min(int(self._frame.value), len(frames) - 1)])
         lighting = cameras.lightings[index]
+        try:
+            self._read_frame(index)  # before anything changes
+        except InputError:
+            self.end()
+            raise
         if self.index is None or cameras.lightings[self.index] != lighting:
             self._lighting.choose(lighting)
-        self._read_frame(index)  # raises here if the frame cannot be read
         self.index, self._placed = index, time.monotonic()
         self._viewer.stop_following()
         used = "not used to train the field" if cameras.held_out[index] else "used to train the field"

@@ -27,9 +27,12 @@ class OnnxPolicy:
             source: A policy folder of `twin train`, or its `policy.onnx`.
 
         Raises:
-            ValueError: no such file, or not a policy of this version. The message is one line.
+            ValueError: no such file, not a policy of this version, or no ONNX Runtime. The message is one line.
         """
-        import onnxruntime
+        try:
+            import onnxruntime
+        except ImportError:
+            raise ValueError("ONNX Runtime is not installed; see the README for how to install it") from None
 
         path = Path(source)
         path = path / "policy.onnx" if path.is_dir() else path

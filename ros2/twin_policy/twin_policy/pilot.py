@@ -113,6 +113,11 @@ class Pilot:
         self._due = 0  # stamp at which the next picture is wanted
         self._used = 0  # stamp of the newest picture in the stack
 
+    @property
+    def has_camera(self) -> bool:
+        """False while there is no valid camera; then `no_camera` says why."""
+        return self._rectifier is not None
+
     # ---- inputs
 
     def set_camera(self, camera: Camera) -> None:
