@@ -152,6 +152,17 @@ def test_obstacle_out_of_view_changes_nothing(box):
         assert np.array_equal(out.rgb, alone.rgb) and np.array_equal(out.depth, alone.depth)
 
 
+def test_a_shadow_is_drawn_while_its_obstacle_is_out_of_view(box, monkeypatch):
+    model, data = box
+    overlay = Compositor(model, baked(hall), SIZE)
+    put(model, data, 0.0, 9.0)
+    darkened = []
+    monkeypatch.setattr(overlay, "_irradiance", lambda *_: "light")
+    monkeypatch.setattr(overlay._shadows, "darken", lambda *given: darkened.append(given[-1]))
+    overlay.render([data], "night")
+    assert darkened == ["light"]
+
+
 def test_irradiance_without_ground_is_refused(box):
     with pytest.raises(InputError, match="no ground"):
         Compositor(box[0], baked(nothing), SIZE)

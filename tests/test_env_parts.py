@@ -16,7 +16,7 @@ import twin
 from twin import commands, runtime
 from twin.config import HELD_OUT, TRAINING, TaskConfig
 from twin.env.domain_randomization import EVALUATION_RANGES, NominalModel, RandomizationSample, Ranges
-from twin.env.drivers import PolicyDriver, RouteDriver, find_callable
+from twin.env.drivers import PolicyDriver, PurePursuit, RouteDriver, find_callable
 from twin.env.env_factory import EnvFactory, episode_spec
 from twin.env.episode import record_episode
 from twin.env.episode_lighting import EpisodeLighting, LightingSets, sample_lighting
@@ -33,6 +33,19 @@ from twin.report.video_writer import read_frames
 from twin.robot import TRACK, WHEEL_RADIUS, WHEELS, HuskyParams
 
 SMALL = {"size": (32, 18)}
+
+
+@pytest.mark.parametrize("period", [0.1, 0.02])
+def test_the_scripted_driver_learns_the_track_ratio_at_any_control_period(period):
+    """A robot turns half as fast as commanded: soon the driver commands twice the yaw rate."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 200)
+    driver = PurePursuit(2.5 * np.column_stack([np.sin(angle), 1.0 - np.cos(angle)]), 1.0, 3.0, period=period)
+    pose = np.zeros(3)
+    for _ in range(round(5.0 / period)):
+        driver.update(pose)
+        v, yaw_rate = driver.command(pose)
+        pose = pose + period * np.array([v * np.cos(pose[2]), v * np.sin(pose[2]), 0.5 * yaw_rate])
+    assert driver._gain == pytest.approx(2.0, abs=0.15)
 
 
 @pytest.fixture(scope="module")

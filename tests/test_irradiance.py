@@ -120,6 +120,20 @@ def test_in_sunshine_the_shadow_falls_on_the_far_side_as_long_as_it_should():
     assert lost[(x < -0.4) & (np.abs(y) > 0.5)].max() < 0.2
 
 
+def test_the_shadow_of_an_obstacle_behind_the_camera_is_seen():
+    model, data = pole()
+    size, k = (120, 120), np.array([80.0, 80.0, 60.0, 60.0])
+    for eye, wanted in ((-0.5, True), (-4.0, False)):  # the sun is at the other side of the pole
+        pose = look_at(np.array([eye, 0.0, 0.0]), np.array([eye - 3.0, 0.0, -1.0]))
+        rays = unproject(pixel_grid(*size), k)
+        down = (rays @ pose[:3, :3].T)[..., 2]
+        depth = np.where(down < 0.0, -1.0 / np.minimum(down, -1e-6), 100.0)
+        rgb = np.ones((*size[::-1], 3), np.float32)
+        sunny = light(share=0.6, elevation=25.0, azimuth=0.0)
+        ContactShadows(model, np.arange(model.ngeom)).darken(rgb, depth, rays, pose, data, sunny)
+        assert (rgb.min() < 0.6) == wanted and (wanted or rgb.min() == 1.0)
+
+
 def ground_and_wall(p):
     """Ground at z = −1 and a wall at y = 2."""
     return np.where((p[..., 2] < -1.0) | (p[..., 1] > 2.0), 9.0, -6.0)

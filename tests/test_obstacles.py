@@ -9,7 +9,16 @@ import pytest
 from twin.config import OBSTACLE_KINDS, ObstacleConfig
 from twin.config_file import load_config
 from twin.env import obstacles as module
-from twin.env.obstacles import add_obstacles, ground_height, obstacle_pose, place, random_distractors, random_obstacles
+from twin.env.obstacles import (
+    ObstacleMotion,
+    add_obstacles,
+    ground_height,
+    obstacle_pose,
+    place,
+    random_distractors,
+    random_obstacles,
+)
+from twin.env.physics import HuskyPhysics
 from twin.errors import InputError
 from twin.geometry.polyline import arc_lengths, nearest_on_route
 from twin.mjcf.husky import add_husky, set_options
@@ -119,6 +128,40 @@ def _corners(model, data, i) -> np.ndarray:
     center, half = model.geom_aabb[i, :3], model.geom_aabb[i, 3:]
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
     return data.geom_xpos[i] + (center + signs * half) @ data.geom_xmat[i].reshape(3, 3).T
+
+
+def test_a_start_inside_an_obstacle_is_a_contact_although_it_pushes_the_robot_away(world):
+    told = (ObstacleConfig("it", "box", 6.0, 0.3),)
+    spec = flat_spec(1e-6)
+    add_obstacles(spec, told, world)
+    robot = HuskyPhysics(spec.compile())
+    robot.move_obstacles = ObstacleMotion(told, robot.data)
+    for x in np.arange(5.6, 6.45, 0.1):
+        robot.set_pose(float(x), 0.0, 0.0)
+        assert robot.touched_geoms, x
+    robot.set_pose(3.0, 0.0, 0.0)
+    assert not robot.touched_geoms
+
+
+def test_only_what_moves_is_moved(world, monkeypatch):
+    told = (ObstacleConfig("still", "cone", 3.0, 1.5), ObstacleConfig("walks", "pedestrian", 6.0, -1.0, to=(6.0, 1.0)))
+    spec = flat_spec()
+    add_obstacles(spec, told, world)
+    model = spec.compile()
+    data, alone = mujoco.MjData(model), mujoco.MjData(model)
+    motion, found = ObstacleMotion(told, data), []
+    monkeypatch.setattr(
+        module, "obstacle_pose", lambda one, *rest: (found.append(one.name), obstacle_pose(one, *rest))[1]
+    )
+    for time in (0.0, 0.4, 1.7, 0.0, 0.9):
+        found.clear()
+        motion(time)
+        assert found == (["walks"] if time else ["still", "walks"])
+        place(told, alone, time)
+        assert np.array_equal(data.mocap_pos, alone.mocap_pos) and np.array_equal(data.mocap_quat, alone.mocap_quat)
+    late = ObstacleMotion(told, mujoco.MjData(model))  # as after an obstacle was dragged during a drive
+    late(0.9)
+    assert np.array_equal(late._data.mocap_pos, data.mocap_pos)
 
 
 def test_unused_obstacles_are_parked(world):

@@ -391,11 +391,13 @@ class Compositor:
     ) -> None:
         """Draws the objects in view of a camera, and their shadows, into picture k of a rendering."""
         mask = worker.renderer.visible_mask(data, pose)
-        if mask is None:
+        if mask is None and not self._shadows.bodies:
             return
         irradiance = self._irradiance(lighting, sunlight)
         if irradiance is not None:
             self._shadows.darken(out.rgb[k], out.depth[k], self._rays, pose, data, irradiance)
+        if mask is None:
+            return
         drawn = worker.renderer.render(data, pose, mask, irradiance)
         if drawn is not None:
             left, top, width, height = drawn.window

@@ -38,7 +38,7 @@ if TYPE_CHECKING:  # not imported at run time: `follow_route` works without dm_c
 GOAL_RADIUS = 1.0  # [m] distance from the goal at which it is reached
 
 _LOOKAHEAD = 1.0  # [m] distance along the route to the point that the robot steers to
-_GAIN_RATE = 0.15  # fraction of the gain's error that is corrected per control step
+_GAIN_RATE = 0.15  # fraction of the gain's error that is corrected per `CONTROL_PERIOD`
 _GAIN_RANGE = (0.5, 2.5)
 _GAIN_MIN_YAW_RATE = 0.15  # [rad/s]; at smaller yaw rates, the measured ratio is mostly noise
 
@@ -94,8 +94,19 @@ class PurePursuit:
     The *foot* is the point of the route nearest to the robot.
     """
 
-    def __init__(self, route: Array, speed: float, max_yaw_rate: float, start: float = 0.0) -> None:
-        """`route` [m] has shape (m, ≥2), `speed` is in m/s, `max_yaw_rate` in rad/s; `start` is an arc length [m]."""
+    def __init__(
+        self,
+        route: Array,
+        speed: float,
+        max_yaw_rate: float,
+        start: float = 0.0,
+        period: float = CONTROL_PERIOD,
+    ) -> None:
+        """`route` [m] has shape (m, ≥2), `speed` is in m/s, `max_yaw_rate` in rad/s; `start` is an arc length [m].
+
+        `period` is the time between two commands [s].
+        """
+        self._period = period
         self._route, self._speed, self._max_yaw_rate = route[:, :2], speed, max_yaw_rate
         self._length = float(arc_lengths(route)[-1])
         self.s = start
@@ -112,7 +123,7 @@ class PurePursuit:
     def command(self, pose: Array) -> tuple[float, float]:
         """Returns v [m/s] and ω [rad/s] for the control step that begins at a pose (x, y, yaw)."""
         if self._last is not None:
-            self._gain = _updated_gain(self._gain, self._last[0], pose, self._last[1])
+            self._gain = _updated_gain(self._gain, self._last[0], pose, self._last[1], self._period)
         target = _pursuit_target(self._route, self.s + _LOOKAHEAD, self._length)
         limit = self._max_yaw_rate
         wanted = np.clip(self._speed * pursuit_curvature(pose, target), -limit, limit)
@@ -193,15 +204,15 @@ def _pursuit_target(route: Array, s: float, length: float) -> Array:
     return route[-1] + direction / max(float(np.linalg.norm(direction)), 1e-9) * (s - length)
 
 
-def _updated_gain(gain: float, previous: Array, pose: Array, command: tuple[float, float]) -> float:
+def _updated_gain(gain: float, previous: Array, pose: Array, command: tuple[float, float], period: float) -> float:
     """Moves the gain towards the ratio of commanded to achieved curvature in the last control step."""
-    turned = float(wrap_angle(pose[2] - previous[2])) / CONTROL_PERIOD
-    moved = float(np.linalg.norm(pose[:2] - previous[:2])) / CONTROL_PERIOD
+    turned = float(wrap_angle(pose[2] - previous[2])) / period
+    moved = float(np.linalg.norm(pose[:2] - previous[:2])) / period
     v, yaw_rate = command
     if abs(yaw_rate) < _GAIN_MIN_YAW_RATE or abs(turned) < _GAIN_MIN_YAW_RATE or yaw_rate * turned < 0 or moved < 0.2:
         return gain
     ratio = (yaw_rate / v) / (turned / moved)
-    return float(np.clip(gain + _GAIN_RATE * (ratio - gain), *_GAIN_RANGE))
+    return float(np.clip(gain + _GAIN_RATE * (period / CONTROL_PERIOD) * (ratio - gain), *_GAIN_RANGE))
 
 
 # ---- drivers of an environment
@@ -223,7 +234,8 @@ class RouteDriver:
         task, pose = environment.task, environment.physics.planar_pose
         if step.first():
             speed = min(task.options.speed, task.world.robot.max_speed)
-            self._pursuit = PurePursuit(task.world.route, speed, task.options.yaw_rate, task.segment.start)
+            limit, period = task.options.yaw_rate, task.options.control_timestep
+            self._pursuit = PurePursuit(task.world.route, speed, limit, task.segment.start, period)
         self._pursuit.update(pose)
         v, yaw_rate = self._pursuit.command(pose)
         return np.array([yaw_rate]) if task.options.action == STEERING else np.array([v, yaw_rate])

@@ -363,12 +363,15 @@ class ContactShadows:
         for body, boxes in self._boxes.items():
             foot = data.xpos[body]
             away = float((foot - pose[:3, 3]) @ pose[:3, 2])
-            if not (0.0 < away < _MAX_DISTANCE) or abs(foot[2] - pose[2, 3]) > _MAX_DISTANCE:
+            # An obstacle beside or behind the camera may throw its shadow into the picture.
+            if not abs(away) < _MAX_DISTANCE or abs(foot[2] - pose[2, 3]) > _MAX_DISTANCE:
                 continue
             share, sun = irradiance.sun(foot[:2])
             size = float(np.abs(boxes[:, :, :2]).max() * np.sqrt(2.0))
             length = min(float(boxes[:, 1, 2].max() * np.linalg.norm(sun[:2]) / sun[2]), _MAX_SHADOW)
             reach = size + max(length, _SKY_REACH)
+            if away < -reach:
+                continue
             index = np.flatnonzero(np.abs(depth - away) < reach)
             points = (rays.reshape(-1, 3)[index] * depth.ravel()[index, None]) @ pose[:3, :3].T + (pose[:3, 3] - foot)
             on = (np.abs(points[:, 2]) < _SHADOW_TOLERANCE) & ((points[:, :2] ** 2).sum(1) < reach**2)

@@ -79,7 +79,7 @@ class PixelObserver:
         o, task = self.options, self.envs[i][1]
         fog = self.lightings[i].fog_at(0.0)
         # Lightings fitted to a photo always have a fog; for a clear day, its extinction is 0.
-        known = fog is not None and o.randomise and o.randomise.hold_known
+        known = self.lightings[i].fog is not None and o.randomise and o.randomise.hold_known
         task.sample = task.drawn.for_known_weather() if known else task.drawn
         has_weather = fog is not None or o.randomise
         sun = main_sun(self.lightings[i].sunlight_at(0.0))

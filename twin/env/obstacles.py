@@ -273,11 +273,15 @@ def place(obstacles: Sequence[ObstacleConfig], data: mujoco.MjData, time: float)
         data.mocap_quat[mocap] = (1.0, 0.0, 0.0, 0.0)
         data.mocap_pos[mocap] = (0.0, 0.0, _PARKED_HEIGHT)
         if one is not None:
-            x, y, yaw = obstacle_pose(one, stored_route(model), time)
-            data.mocap_pos[mocap] = (x, y, ground_height(model, x, y) - _SINK_DEPTH)
-            data.mocap_quat[mocap] = (np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2))
+            _set_pose(data, mocap, obstacle_pose(one, stored_route(model), time))
     if wanted:
         raise InputError(f"the model has no {', '.join(wanted)}; add it as [[obstacle]], or by add_obstacles")
+
+
+def _set_pose(data: mujoco.MjData, mocap: int, pose: tuple[float, float, float]) -> None:
+    x, y, yaw = pose
+    data.mocap_pos[mocap] = (x, y, ground_height(data.model, x, y) - _SINK_DEPTH)
+    data.mocap_quat[mocap] = (np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2))
 
 
 def obstacle_pose(obstacle: ObstacleConfig, route: Array, time: float) -> tuple[float, float, float]:
@@ -472,8 +476,18 @@ class ObstacleMotion:
     def __init__(self, obstacles: Sequence[ObstacleConfig], data: mujoco.MjData) -> None:
         self.obstacles, self._data = tuple(obstacles), data
         self.moving = any(one.to for one in self.obstacles)
+        self._moving: list[tuple[ObstacleConfig, int]] | None = None  # moving obstacles, and their mocap bodies
+        self._route = np.zeros((0, 3))
 
     def __call__(self, time: float) -> None:
-        """Moves obstacles to their poses at a time [s]; static ones are set only at time 0."""
-        if self.moving or time == 0.0:
+        """Moves obstacles to their poses at a time [s]; static ones are set only at time 0, and by the first call."""
+        if time == 0.0 or self._moving is None:
             place(self.obstacles, self._data, time)
+        if self._moving is None:
+            bodies = [(one, self._data.model.body(body_name(one, k))) for k, one in enumerate(self.obstacles)]
+            self._moving = [(one, int(body.mocapid[0])) for one, body in bodies if one.to]
+            if self._moving:
+                self._route = stored_route(self._data.model)
+        elif time != 0.0:
+            for one, mocap in self._moving:
+                _set_pose(self._data, mocap, obstacle_pose(one, self._route, time))

@@ -99,12 +99,15 @@ class HuskyPhysics:
         self.data.qpos[:3], self.data.qpos[3:7] = position, quaternion
         if self.move_obstacles:
             self.move_obstacles(0.0)
+        mujoco.mj_forward(self.model, self.data)
+        overlapping = self._contacts()  # what the robot is put into pushes it away while it settles
         mujoco.mj_step(self.model, self.data, round(_SETTLE_TIME / self.model.opt.timestep))
         self.data.qvel[:], self.data.time = 0.0, 0.0
         if speed:
             self._roll(speed)
         mujoco.mj_forward(self.model, self.data)
         self.begin()
+        self.touched_geoms |= overlapping
 
     def _roll(self, speed: float) -> None:
         """Sets wheels, motors and body in motion, straight on, as a command of `speed` [m/s] does in the end."""

@@ -57,7 +57,7 @@ BUMPER_OFFSET = 0.5  # [m] from the base to the bumper; the goal is reached when
 ROLLOVER_COSINE = 0.5  # cosine of the tilt beyond which the robot has rolled over
 STUCK_TIME, STUCK_DISTANCE = 5.0, 0.1  # [s], [m]: a robot that moves less than this distance in this time is stuck
 _STATE_MARGIN = 10.0  # bounds of speed and yaw rate in the state, as multiples of the controller's limits
-EPISODE_VERSION = 7
+EPISODE_VERSION = 8
 """Version of the episodes of a training. Increase it whenever a change of the code changes the starts of a seed with
 `Options.start_along`, when these episodes are cut off, or which ends of episodes are terminal."""
 # With `Options.start_along`: at the start, largest distance from the route / corridor half width, largest heading /

@@ -16,7 +16,6 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from scipy.optimize import root
 
 from twin.mjcf.husky_visuals import add_visuals
 from twin.robot import (
@@ -380,6 +379,8 @@ def coulomb_track_ratio(center: Array) -> float:
         force = -load[:, None] * slip / np.linalg.norm(slip, axis=1, keepdims=True)
         moment = arm[:, 0] * force[:, 1] - arm[:, 1] * force[:, 0]
         return np.array([force[:, 0].sum(), force[:, 1].sum(), moment.sum()])
+
+    from scipy.optimize import root  # slow to import
 
     solution = root(residual, np.array([0.0, -center[0] * 0.5, 1.0 + (WHEELBASE / TRACK) ** 2]))
     if not solution.success:

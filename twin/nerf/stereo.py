@@ -49,7 +49,10 @@ def stereo_depths(pixels: TrainingPixels, seed: int, device: str) -> tuple[Depth
     shapes = np.stack([pixels.height // step, pixels.width // step], 1).astype(np.int32)
     rows, columns = int(shapes[:, 0].max()), int(shapes[:, 1].max())
     frames = kernels.GrayImages()
-    gray = pixels.colors.astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32) / 255.0
+    gray = np.empty(len(pixels.colors), np.float32)
+    for run in zip(pixels.start[:-1].tolist(), pixels.start[1:].tolist(), strict=True):
+        # Frame by frame, as colors in floating point take four times the memory of all frames.
+        gray[slice(*run)] = pixels.colors[slice(*run)] @ np.array([0.299, 0.587, 0.114], np.float32) / 255.0
     frames.gray = wp.array(gray, dtype=wp.float32, device=device)
     frames.start = wp.array(pixels.start[:-1].astype(np.int64), dtype=wp.int64, device=device)
     frames.width = wp.array(pixels.width.astype(np.int32), dtype=wp.int32, device=device)
