@@ -392,6 +392,15 @@ def test_a_clock_that_was_set_back(tmp_path: Path, capsys: pytest.CaptureFixture
         read_contents(bag)
 
 
+def test_a_first_picture_without_a_stamp_has_the_time_of_its_recording(tmp_path: Path) -> None:
+    """As by drivers that publish before their clock is set; the film would last 54 years."""
+    film = pictures(views(SHIFTS), TIMES)
+    film[0].message.header.stamp.sec = film[0].message.header.stamp.nanosec = 0
+    contents = read_contents(write(tmp_path / "camera", [camera_info(PINHOLE), *film]))
+    assert contents.duration == pytest.approx(TIMES[-1], abs=0.02)
+    assert contents.stamps[0] == pytest.approx(START, abs=20_000_000)
+
+
 # ---- bad bags
 
 
@@ -418,6 +427,10 @@ def _modelled(model: str) -> list[Recorded]:
 
 BAD = {
     "no pictures": (lambda: drive(straight(), TIMES), r"no topic with pictures among /gps/fix, /odom; record"),
+    "only infrared": (
+        lambda: [replace(one, topic="/infra1/image_rect_raw") for one in pictures(views(SHIFTS), TIMES)],
+        r"only pictures of depth, infrared or masks: /infra1/image_rect_raw; give one of them as the topic",
+    ),
     "nothing": (list, r"no topic with pictures among none"),
     "an unknown encoding": (lambda: _encoded("mono16"), r"/camera/image: encoding 'mono16'; expected one of rgb8"),
     "rows too short": (lambda: _short(), r"/camera/image: rgb8 picture of 160 x 120 px with 100 bytes a row"),

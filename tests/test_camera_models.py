@@ -28,6 +28,23 @@ def test_undistorted_pixels_see_along_the_same_ray(model: str, params: list[floa
     np.testing.assert_allclose(rays, wanted, atol=2e-4)
 
 
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("SIMPLE_RADIAL", [640.0, 640.0, 360.0, -0.28]),
+        ("OPENCV", [640.0, 640.0, 640.0, 360.0, -0.35, 0.0, 0.0, 0.0]),
+    ],
+)
+def test_no_pixel_lies_where_the_distortion_runs_back(model: str, params: list[float]) -> None:
+    """Beyond a radius of 1 / √(−3 k) a larger angle is nearer to the center, where other things are seen."""
+    lens = Lens(model, tuple(params), 1280, 720)
+    pinhole, mapping = undistortion(lens)
+    assert mapping is not None
+    corner = unproject(np.array([[0.5, 0.5]]), pinhole.intrinsics)[0, :2]
+    assert np.linalg.norm(corner) < 1.0 / np.sqrt(-3.0 * params[4 if model == "OPENCV" else 3])
+    assert (np.diff(mapping[0, :640, 0]) > 0.0).all() and (np.diff(mapping[:360, 0, 1]) > 0.0).all()
+
+
 def test_undistortion_undoes_distortion(tmp_path: Path) -> None:
     lens = Lens("SIMPLE_RADIAL", (300.0, 160.0, 120.0, 0.1), 320, 240)
 

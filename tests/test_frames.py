@@ -83,6 +83,26 @@ def test_slots_follow_the_clock_of_a_film_with_a_variable_rate(tmp_path: Path) -
     assert (capture.times < 0.95).sum() == 1 and len(capture.names) == 7
 
 
+def test_a_pause_takes_no_slots(tmp_path: Path) -> None:
+    """Two drives of two seconds, an hour apart: each has half of the frames, at its own times."""
+    times = [100 * i for i in range(20)] + [3_600_000 + 100 * i for i in range(20)]
+    film(tmp_path / "a.mkv", views([6 * i for i in range(len(times))]), times)
+    capture, _, _ = captured(tmp_path, [SourceConfig(path="a.mkv")], frames=10)
+    assert len(capture.names) == 10 and (capture.times < 2.0).sum() == 5 and (capture.times >= 3600.0).sum() == 5
+
+
+def test_sources_without_a_lighting_have_the_names_of_their_films(tmp_path: Path, capsys) -> None:
+    for name in ("день.mkv", "ночь.mkv", "a/GX01.mkv", "b/GX01.mkv"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        film(tmp_path / name, views([0, 6, 12, 18]))
+    sources = [SourceConfig(path=name) for name in ("день.mkv", "ночь.mkv", "a/GX01.mkv", "b/GX01.mkv")]
+    capture, _, _ = captured(tmp_path, sources)
+    assert list(dict.fromkeys(source.lighting for source in capture.sources)) == ["день", "ночь", "GX01"]
+    assert len({source.name for source in capture.sources}) == 4
+    told = capsys.readouterr().err
+    assert "a/GX01.mkv and b/GX01.mkv count as filmed under one lighting, 'GX01'" in told and "день" not in told
+
+
 @pytest.mark.parametrize("slots", [1, 3, 7, 20, 80])
 def test_every_frame_has_one_slot_and_slots_are_in_order(slots: int) -> None:
     timing = FilmTiming(np.round(np.arange(80) / 15.0, 3), 0.0, 80)  # millisecond stamps, as Matroska has them

@@ -500,6 +500,16 @@ def test_metric_poses_are_taken_as_they_are(tmp_path: Path) -> None:
     assert metrics["scale"] == 1.0 and metrics["gravity_source"] == "poses"
 
 
+def test_given_poses_that_lie_on_their_side_are_refused(tmp_path: Path) -> None:
+    film = _path()
+    tilted = Similarity(1.0, np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), np.zeros(3))
+    world = _world(tmp_path / "s", [film], _points(film, np.random.default_rng(2)), tilted, posed=True)
+    with pytest.raises(
+        InputError, match=r"mean up axis is \d\d° off the z axis of the given poses; expected poses with z up"
+    ):
+        world.run(tmp_path / "out", up="poses", poses_are_metric=True)
+
+
 def test_georeferenced_poses_are_refused(tmp_path: Path) -> None:
     """With up = "poses" the world would keep them, and single precision rounds 5,400 km to half a meter."""
     film = _path()

@@ -41,8 +41,8 @@ class Stage:
 
 _MJCF_OF_MESH = ("mjcf.route", "mjcf.half_width", "mjcf.corridor_margin")  # the mjcf settings that stage mesh reads
 PIPELINE = (
-    Stage("capture", "twin.capture.frames", 4, ("source", "capture"), ()),
-    Stage("cameras", "twin.capture.sfm", 5, ("cameras",), ("capture",)),
+    Stage("capture", "twin.capture.frames", 5, ("source", "capture"), ()),
+    Stage("cameras", "twin.capture.sfm", 6, ("cameras",), ("capture",)),
     Stage("metric", "twin.capture.metric", 4, ("metric",), ("capture", "cameras")),
     Stage("field", "twin.nerf.trainer", 11, ("nerf", "mjcf.route"), ("cameras", "metric")),
     Stage("mesh", "twin.assets.mesh", 8, ("mesh", "route", "branch", *_MJCF_OF_MESH), ("cameras", "metric", "field")),

@@ -185,7 +185,8 @@ def _check(config: SceneConfig, folder: str) -> None:
     _require(
         any((*heights, metric.distance, metric.gps, metric.odometry, metric.marker, metric.poses_are_metric)),
         "[metric] gives no scale; give one or more of "
-        "camera_height = 1.2 (lens above ground [m]), distance = {metres, frame_a, a, b} (two marked points), "
+        "camera_height = 1.2 (lens above ground [m]), "
+        "distance = {metres, frame_a, a, b} (two marked points; a rough camera_height gives the frames first), "
         "gps = true (EXIF or NavSatFix of a bag), odometry = true (of a bag), "
         "marker = {family, id, size} (printed ArUco or AprilTag), poses_are_metric = true",
     )

@@ -22,7 +22,7 @@ from twin.assets.ground import Ground, lattice_faces
 from twin.assets.tsdf import compact
 from twin.assets.views import Views, render_views
 from twin.errors import InputError
-from twin.files import load_arrays
+from twin.files import load_arrays, require_writable
 from twin.geometry.cameras import Cameras, RenderableField, pixel_grid, unproject
 from twin.geometry.images import psnr, resize, to_uint8, write_image
 from twin.geometry.shadow_map import ShadowCasters, angles, direction
@@ -321,6 +321,7 @@ def relight(
     source = find_sun(scene, sun, time, location, heading)
     if source:
         require_stage(scene, "mesh")  # checked first, since reading the baked field takes time
+    require_writable(scene.lightings, "make it writable: the lighting is saved there")
     image, facts = load_photo(photo, None)
     # Before the photo is fitted, which takes a minute and would be lost if the build is damaged.
     casters = shadow_casters(scene, BakedField.load(scene.stage("field"))) if source else None

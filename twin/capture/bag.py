@@ -55,7 +55,7 @@ MIN_POSES = 10
 """A topic with fewer poses, such as the goals that an operator clicks on a map, is used only if no topic has this
 many."""
 # A topic with one of these words in its name is used for pictures only if it is given explicitly.
-_OTHER_IMAGES = ("depth", "confidence", "disparity", "mask", "infra")
+_OTHER_IMAGES = re.compile(r"(?<![^/_])(depth|confidence|disparity|mask|infra\d*)(?![^/_])")
 _RECTIFIED = re.compile(r"(?<![^/_])rect(ified)?(?![^/_])")  # words end at slashes and underscores
 # [ns] If the median difference between header and recording times exceeds this, the headers use another clock.
 _CLOCK = 1_000_000_000
@@ -213,15 +213,21 @@ def messages_by_topic(connections: Iterable[Any], types: Sequence[str]) -> dict[
 def picture_topics(connections: Iterable[Any]) -> list[str]:
     """The topics with pictures, except those of `_OTHER_IMAGES`, sorted by decreasing number of messages."""
     counts = messages_by_topic(connections, (RAW, COMPRESSED))
-    good = [topic for topic in counts if not any(word in topic for word in _OTHER_IMAGES)]
+    good = [topic for topic in counts if not _OTHER_IMAGES.search(topic)]
     return sorted(good, key=lambda topic: (counts[topic], topic), reverse=True)
 
 
 def choose_pictures(connections: Sequence[Any], path: Path, topic: str = "") -> str:
     """The topic of the pictures: the given one, or the one with most messages. Raises InputError if there is none."""
-    if topic in messages_by_topic(connections, (RAW, COMPRESSED)):
+    every = messages_by_topic(connections, (RAW, COMPRESSED))
+    if topic in every:
         return topic
     found = picture_topics(connections)
+    if not found and every:
+        raise InputError(
+            f"{path}: only pictures of depth, infrared or masks: {join_names(list(every), most=12)}; give one of them "
+            "as the topic, or record the front camera"
+        )
     if not found:
         raise InputError(f"{path}: no topic with pictures among {topic_names(connections)}; record the front camera")
     if topic:
@@ -324,6 +330,8 @@ def message_times(times: NDArray[np.int64], topic: str, path: Path) -> NDArray[n
     if abs(int(np.median(recorded - header))) > _CLOCK:
         runtime.log_line(f"{path}: headers on {topic} have another clock; the times of recording are used")
         return recorded.copy()
+    if not header.all():  # as by drivers whose first message has an empty stamp
+        header = np.where(header, header, recorded - np.int64(np.median((recorded - header)[header > 0])))
     back = (header[:-1] - header[1:]).max(initial=0)
     if back > _SET_BACK:
         runtime.log_line(

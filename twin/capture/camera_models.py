@@ -30,6 +30,9 @@ PixelMap = NDArray[np.float32]
 (0, 0) is the center of the first pixel."""
 
 _NEGLIGIBLE_DISTORTION = 0.1  # [px] smaller displacements are ignored
+_STEP = 0.01  # [m at a depth of 1 m] step outward by which the growth of a distortion is measured
+_LEAST_GROWTH = 0.1  # of the distance of a raw pixel from the center; a fisheye lens has this 72° off its axis
+_SAME_DIRECTION = 1e-3  # largest difference between a ray (x, y, 1) and the one that its raw pixel shows
 _MAX_ZOOM = 4.0  # largest ratio of the pinhole's focal length to that of the lens
 _MAX_ASPECT_ERROR = 0.01
 _FOCAL_RANGE = (0.05, 8.0)  # plausible focal lengths / longer side; at 8, the angle of view is 7°
@@ -220,8 +223,21 @@ def border_pixels(lens: Lens) -> Array:
 
 
 def _fits_inside(lens: Lens, pixels: Array, pinhole: Lens) -> bool:
-    raw = raw_pixels(lens, unproject(pixels, pinhole.intrinsics))
-    return bool(np.all((raw >= 0.0) & (raw <= [lens.width, lens.height])))
+    """True if a pinhole camera's pixels show what is in the lens's image.
+
+    Far from the center, a polynomial's distortion may run back into the image, where other directions are seen. So the
+    raw pixels must show the directions that they were computed from, and larger angles must be farther out.
+    """
+    rays = unproject(pixels, pinhole.intrinsics)
+    raw = raw_pixels(lens, rays)
+    if not np.all((raw >= 0.0) & (raw <= [lens.width, lens.height])):
+        return False
+    if not np.all(np.abs(np.asarray(lens.camera.cam_from_img(raw)) - rays[:, :2]) < _SAME_DIRECTION):
+        return False
+    outward = rays[:, :2] / np.maximum(np.linalg.norm(rays[:, :2], axis=1, keepdims=True), 1e-9)
+    farther = raw_pixels(lens, rays + _STEP * np.pad(outward, ((0, 0), (0, 1))))
+    growth = ((farther - raw) / lens.intrinsics[:2] * outward).sum(1) / _STEP  # 1 without distortion
+    return bool(np.all(growth > _LEAST_GROWTH))
 
 
 def _max_displacement(lens: Lens, pinhole: Lens) -> float:

@@ -7,6 +7,7 @@ name is `<source>/<index>`, where the index is its position in the whole film, o
 order. *Held-out* frames are never trained on.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -39,7 +40,8 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     Raises InputError: an unreadable or impossible input, or fewer than two usable frames in all.
     """
     names = source_names([source.path for source in config.source])
-    lightings = [source.lighting or _source_name(source.path)[:MAX_NAME] for source in config.source]
+    lightings = [source.lighting or _default_lighting(scene.root, source.path) for source in config.source]
+    _tell_of_shared_lightings(config.source, lightings)
     for source, lighting in zip(config.source, lightings, strict=True):
         check_lighting(lighting, f"{source.path}: lighting")
         _check_calibration(scene.root / source.path, source)
@@ -263,9 +265,35 @@ def _with_one_camera(kept: KeptFrames) -> KeptFrames:
     return replace(kept, info=replace(kept.info, calibrated=False))
 
 
+def _default_lighting(root: Path, path: str) -> str:
+    """The lighting of a source without a given one: the specific part of its path, in any script."""
+    chosen = _specific_part(path, Path(path).name if (root / path).is_dir() else Path(path).stem)
+    kept = "".join("_" if c in ":/\\" or not c.isprintable() else c for c in chosen).strip(". ")
+    return (kept or "source")[: MAX_NAME // 2]
+
+
+def _tell_of_shared_lightings(sources: Sequence[SourceConfig], lightings: Sequence[str]) -> None:
+    """Logs which sources share a lighting only because their names are alike."""
+    by_name: dict[str, list[str]] = {}
+    for source, lighting in zip(sources, lightings, strict=True):
+        if not source.lighting:
+            by_name.setdefault(lighting, []).append(source.path)
+    for lighting, paths in by_name.items():
+        if len(paths) > 1:
+            runtime.log_line(
+                f"  {' and '.join(paths)} count as filmed under one lighting, {lighting!r}, by their names; if they "
+                "were not, give each [[source]] a lighting"
+            )
+
+
+def _specific_part(path: str, last: str) -> str:
+    """The last part of a path that is not generic; `last` replaces its last part."""
+    parts = [part for part in (*Path(path).parent.parts, last) if part not in ("", ".", "..", "/")]
+    specific = [part for part in parts if not part.startswith("transforms") and part.lower() not in _GENERIC_NAMES]
+    return specific[-1] if specific else (parts[-1] if parts else "source")
+
+
 def _source_name(path: str) -> str:
     """A source's name: the last part of its path that is not generic, without suffix."""
-    parts = [part for part in (*Path(path).parent.parts, Path(path).stem) if part not in ("", ".", "..", "/")]
-    specific = [part for part in parts if not part.startswith("transforms") and part.lower() not in _GENERIC_NAMES]
-    chosen = specific[-1] if specific else (parts[-1] if parts else "source")
+    chosen = _specific_part(path, Path(path).stem)
     return "".join(c if c.isascii() and (c.isalnum() or c in "-_.") else "_" for c in chosen).strip(".") or "source"

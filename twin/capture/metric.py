@@ -34,6 +34,7 @@ _INITIAL_FRACTION = 0.08
 """Fraction of the first source's path, from its start, that gives the initial driving direction."""
 _MAX_OFFSET = 10_000.0  # [m] largest coordinate of a camera; later stages compute in single precision
 _SAME_HEIGHT = 0.1  # camera heights of sources that differ by more than this share are not the same
+_MAX_UP_TILT = 45.0  # [°] largest angle between z of given poses that are z up, and the cameras' mean up axis
 _FLOOR_QUANTILE = 0.02  # if no road is found, the floor is at this quantile of the points' heights
 
 
@@ -100,6 +101,11 @@ def _find_up(cameras: Cameras, points: Array, method: str, capture: Capture) -> 
     else:
         if capture.camera_to_world is None:
             raise InputError('metric.up = "poses": the input has no poses; use "ground" or "cameras"')
+        if (tilt := np.degrees(np.arccos(np.clip(camera_up(cameras.camera_to_world)[2], -1.0, 1.0)))) > _MAX_UP_TILT:
+            raise InputError(
+                f'metric.up = "poses": the cameras\' mean up axis is {tilt:.0f}° off the z axis of the given poses; '
+                'expected poses with z up; use metric.up = "ground"'
+            )
         gravity = Gravity(np.array([0.0, 0.0, 1.0]), 0.0, "poses")
     return gravity, find_road(points, cameras.positions, gravity.direction)
 

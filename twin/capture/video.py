@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from fractions import Fraction
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 
 import av
@@ -291,6 +291,9 @@ def _contrast_stretched(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 # ---- timing of a film
 
+# A longer time between two frames is a pause of the recording: [s], and median times between frames.
+_PAUSE, _PAUSE_INTERVALS = 2.0, 5.0
+
 
 @dataclass(frozen=True)
 class FilmTiming:
@@ -301,12 +304,12 @@ class FilmTiming:
     declared: int  # number of frames that the container declares and shows; n if it declares none
     consecutive: bool = False  # true if decoded frames have no presentation times; they are numbered one by one
 
-    @property
+    @cached_property
     def interval(self) -> float:
         """Median time between frames [s]."""
         return float(np.median(np.diff(self.times))) if len(self.times) > 1 else 1.0
 
-    @property
+    @cached_property
     def duration(self) -> float:
         """Time from the first frame to the end of the last one [s]."""
         return float(self.times[-1] + self.interval)
@@ -383,7 +386,10 @@ def in_segments(times: Array, segments: tuple[tuple[float, ...], ...]) -> NDArra
 def _joined_segments(
     timing: FilmTiming, segments: tuple[tuple[float, ...], ...], path: Path
 ) -> tuple[FilmTiming, NDArray[np.int64]]:
-    """The timing of a film of the kept segments only, and each original frame's position in it (−1 if cut out)."""
+    """The timing of a film of the kept segments without pauses, and each frame's position in it (−1 if cut out).
+
+    While nothing was recorded, as in a bag that was paused, there are no frames that could fill slots.
+    """
     used = in_segments(timing.times, segments)
     if segments and used.sum() < 2:
         raise InputError(
@@ -391,10 +397,12 @@ def _joined_segments(
             f"the film runs from 0 to {timing.times[-1]:.2f} s"
         )
     position = np.where(used, np.cumsum(used) - 1, -1)
-    if used.all():
+    step = np.diff(timing.times[used])
+    pause = (np.diff(np.flatnonzero(used)) > 1) | (step > max(_PAUSE, _PAUSE_INTERVALS * timing.interval))
+    if used.all() and not pause.any():
         return timing, position
-    # The last frame of a segment lasts one frame interval.
-    step = np.where(np.diff(np.flatnonzero(used)) > 1, timing.interval, np.diff(timing.times[used]))
+    # The last frame before a cut or a pause lasts one frame interval.
+    step = np.where(pause, timing.interval, step)
     return FilmTiming(np.concatenate([[0.0], np.cumsum(step)]), timing.start, int(used.sum())), position
 
 
@@ -518,7 +526,8 @@ def _sharpest_per_slot(
             count.blank += 1
             continue
         time = float(timing.times[index]) if index < len(timing.times) else index * timing.interval
-        order, at = (int(position[index]), float(kept_timing.times[position[index]])) if segments else (index, time)
+        inside = index < len(position)
+        order, at = (int(position[index]), float(kept_timing.times[position[index]])) if inside else (index, time)
         candidate = _Candidate(slot_of(order, at, kept_timing, slots), index, time, sharpness(gray), frame)
         if best is not None and candidate.slot != best.slot:
             yield best
