@@ -229,6 +229,17 @@ def test_tiles_do_not_overlap() -> None:
     assert used.max() == 1 and used.sum() == (side**2).sum()
 
 
+def test_the_texture_is_no_higher_than_viewers_support(monkeypatch) -> None:
+    """Equal tiles leave a strip of every row empty, so all may have fewer texels than the texture, and yet not fit."""
+    monkeypatch.setattr(gltf, "_SIDE", 256)
+    monkeypatch.setattr(gltf, "_MIN_TEXEL", 1e-4)
+    rng = np.random.default_rng(0)
+    corner = rng.uniform(-0.4, 0.4, (60, 1, 3)) * [1, 1, 0] + 0.07 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    faces = np.arange(180).reshape(-1, 3)
+    texture, _ = gltf.bake(corner.reshape(-1, 3), faces, floor_views([(0.0, -0.2, 2.0)]))
+    assert max(texture.shape[:2]) <= 256
+
+
 def test_vertices_have_the_colors_of_the_views() -> None:
     vertices = np.array([[0.3, 0.3, 0.0], [-0.3, 0.3, 0.0], [0.3, -0.3, 0.0], [0.3, 0.31, -0.5]])
     colours = gltf.vertex_colors(floor_views(), vertices)

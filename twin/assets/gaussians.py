@@ -1,4 +1,4 @@
-"""Gaussian splats (Curbl et al. 2023, "3D Gaussian Splatting") of a radiance field, and their files.
+"""Gaussian splats (Kerbl et al. 2023, "3D Gaussian Splatting") of a radiance field, and their files.
 
 These Gaussians are not fitted to photos. Each is made from one pixel of a view rendered from a filmed pose: it is a
 disk as large as the pixel's footprint on the surface. Where views overlap, the smallest disk is kept. The colors do not

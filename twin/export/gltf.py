@@ -35,7 +35,7 @@ from twin.warp_runtime import wp
 VIEWS, WIDTH, FAR = 96, 640, 100.0
 """Number of rendered views, width of all pictures [px], and the z-depth where background starts [m]."""
 _Z_UP_TO_Y_UP = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-_SIDE = 4096  # [px] largest width of the texture; every viewer supports this size
+_SIDE = 4096  # [px] largest width and height of the texture; every viewer supports this size
 _MIN_TEXEL = 0.01  # [m] least side of a texel on its face
 _MAX_TILE = 256  # [px] greatest side of a face's tile
 _COARSER = 1.1  # factor by which texels grow until all tiles fit
@@ -108,8 +108,7 @@ def bake(
         InputError: no view shows the mesh.
     """
     corner, order = _turned(vertices[faces])
-    side = _tile_sides(corner, views)
-    x, y, size = pack_tiles(side)
+    side, x, y, size = _tiles(corner, views)
     height = int((y + side).max())
     texture = np.zeros((height, size, 3), np.uint8)
     u_axis, v_axis = ((corner[:, k] - corner[:, 0]) / (side - 1)[:, None] for k in (1, 2))
@@ -160,16 +159,21 @@ def _turned(corners: Array) -> tuple[Array, NDArray[np.int64]]:
     return np.take_along_axis(corners, order[:, :, None], 1).astype(np.float64), order
 
 
-def _tile_sides(corner: Array, views: Views) -> NDArray[np.int64]:
-    """Sides (f,) of the tiles [px]: texels are as large as a pixel of the nearest view, or larger so that all fit."""
+def _tiles(corner: Array, views: Views) -> tuple[NDArray[np.int64], NDArray, NDArray, int]:
+    """Sides (f,) of the tiles, their left and top edges, and the texture's width [px].
+
+    Texels are as large as a pixel of the nearest view, or larger so that all tiles fit.
+    """
     legs = np.linalg.norm(corner[:, 1:] - corner[:, :1], axis=-1).max(1)
     nearest = cKDTree(views.camera_to_world[:, :3, 3]).query(corner.mean(1))[0]
     texel = np.maximum(nearest / views.intrinsics[:, 0].mean(), _MIN_TEXEL)
     while True:
         side = np.clip(np.ceil(legs / texel).astype(np.int64) + 1, 2, _MAX_TILE)
-        if (side**2).sum() < 0.97 * _SIDE**2 or (side == 2).all():
-            return side
-        texel *= _COARSER
+        if (side**2).sum() < _SIDE**2 or (side == 2).all():
+            x, y, width = pack_tiles(side)
+            if (y + side).max() <= _SIDE or (side == 2).all():
+                return side, x, y, width
+        texel = texel * _COARSER
 
 
 def pack_tiles(side: NDArray[np.int64]) -> tuple[NDArray, NDArray, int]:
