@@ -230,13 +230,12 @@ def test_tiles_do_not_overlap() -> None:
 
 
 def test_the_texture_is_no_higher_than_viewers_support(monkeypatch) -> None:
-    """Equal tiles leave a strip of every row empty, so all may have fewer texels than the texture, and yet not fit."""
+    """Eight tiles of 86 px have fewer texels than 256 × 256, but only two fit into a row, so four rows are too high."""
     monkeypatch.setattr(gltf, "_SIDE", 256)
-    monkeypatch.setattr(gltf, "_MIN_TEXEL", 1e-4)
-    rng = np.random.default_rng(0)
-    corner = rng.uniform(-0.4, 0.4, (60, 1, 3)) * [1, 1, 0] + 0.07 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
-    faces = np.arange(180).reshape(-1, 3)
-    texture, _ = gltf.bake(corner.reshape(-1, 3), faces, floor_views([(0.0, -0.2, 2.0)]))
+    monkeypatch.setattr(gltf, "_MAX_TILE", 86)
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]]) * 40.0 + np.arange(8)[:, None, None] * [0.1, 0.0, 0.0] - 15.0
+    corners[..., 2] = 0.0
+    texture, _ = gltf.bake(corners.reshape(-1, 3), np.arange(24).reshape(-1, 3), floor_views([(0.0, -0.2, 2.0)]))
     assert max(texture.shape[:2]) <= 256
 
 
