@@ -549,6 +549,20 @@ def test_a_wrong_table_leaves_the_last_forecast_alone(tmp_path: Path) -> None:
     assert (root / "forecast" / "forecast.json").read_bytes() == before
 
 
+def test_trials_of_a_policy_that_was_trained_further_are_not_its_own(tmp_path: Path) -> None:
+    twin, real = cells(n=6, driven=6)
+    root = scene(tmp_path / "road", twin)
+    table = results(tmp_path / "results.csv", real)
+    (root / "validation" / "validated.json").write_text(json.dumps({"policies": {"p0": "new", "p1": "same"}}))
+    for name, digest in (("p0", "old"), ("p1", "same"), ("p2", "unknown")):
+        (root / "trials" / name).mkdir(parents=True)
+        (root / "trials" / name / "trial.json").write_text(json.dumps({"name": name, "policy_digest": digest}))
+    with pytest.raises(InputError, match=r"trials/p0/trial.json: p0 was trained further since this trial"):
+        forecast(root, [table])
+    (root / "trials" / "p0" / "trial.json").write_text(json.dumps({"name": "p0"}))  # of an earlier version
+    forecast(root, [table])
+
+
 def test_names_from_files_are_text() -> None:
     evil = '<script>alert("1")</script>&$x$'
     twin, real = cells(n=6, driven=6)

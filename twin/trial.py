@@ -28,7 +28,7 @@ from twin.evaluation.trial_judge import JudgedTrial, TrialViews, judge, replay, 
 from twin.evaluation.trials import REAL_CSV, Trial, check_twin_lighting, read_real_trials, write_real_trials
 from twin.files import read_json, wrap_read_errors, write_json
 from twin.geometry.poses import wrap_angle
-from twin.learn.policy import Policy, find_policy, load_policy
+from twin.learn.policy import Policy, find_policy, load_policy, policy_digest
 from twin.loading import load_writable
 from twin.report.drive_dataset import drives_summary, write_bag_dataset
 from twin.report.drive_video import write_trial_video
@@ -119,6 +119,7 @@ def evaluate_trial(
             "task": row.task,
             "lighting": lighting,
             "twin_lighting": compared,
+            "policy_digest": policy_digest(find_policy(root, policy_name)),
         }
         figures = head | _figures(recording, trial, replayed, fit, views, apart)
         half_width = factory.options.half_width or factory.world.half_width

@@ -36,8 +36,6 @@ from twin.evaluation.trials import (
     worst_episode,
 )
 from twin.files import (
-    digest_file,
-    digest_json,
     read_json,
     require_text,
     wrap_read_errors,
@@ -45,7 +43,7 @@ from twin.files import (
     write_json,
     write_text,
 )
-from twin.learn.policy import JSON, find_policy, load_policy
+from twin.learn.policy import find_policy, load_policy, policy_digest
 from twin.learn.policy_evaluation import CHUNK, EpisodeChunk, EpisodeResult, run_chunks, run_chunks_on_ray
 from twin.loading import Twin, load_writable
 from twin.report.policy_card import write_policy_cards
@@ -305,7 +303,7 @@ def _check_same(folder: Path, twin: Twin, task: str, lightings: Sequence[str], p
     driven_by = {t.policy for t in trials}
     others = {name: str(one) for name, one in before.items() if name not in policies and one.exists()}
     for name, source in (others | policies).items():
-        digest = _digest(source)
+        digest = policy_digest(source)
         if name in driven_by and recorded["policies"].get(name) != digest:
             instead = ", or copy the policy to another name" if name in policies else " to validate again"
             raise InputError(
@@ -323,14 +321,6 @@ def _check_same(folder: Path, twin: Twin, task: str, lightings: Sequence[str], p
 def _road(task: str, lighting: str) -> str:
     """Key of a task under a lighting; all sampled lightings have the same key, since they come from the same field."""
     return f"{task}, {'drawn' if lighting.startswith(SAMPLED_LIGHTING) else lighting}"
-
-
-def _digest(source: str) -> str:
-    """Digest of a policy's files. For a function, whose code is unknown, the digest of its name."""
-    path = Path(source)
-    if path.is_dir():
-        return digest_file(path / JSON)  # it contains the digest of the weights
-    return digest_file(path) if path.is_file() else digest_json(source)
 
 
 def _draw_maps(twin: Twin, folder: Path, trials: Sequence[Trial]) -> None:

@@ -27,7 +27,7 @@ from safetensors.numpy import save as safetensors_save
 
 from twin.config import STEERING, TWIST
 from twin.errors import InputError, name_hint, short_repr
-from twin.files import atomic_path, digest_file, json_bytes, parse_json, read_bytes, read_json
+from twin.files import atomic_path, digest_file, digest_json, json_bytes, parse_json, read_bytes, read_json
 from twin.learn.policy_network import Architecture, onnx_bytes
 from twin.types import Array32, Image
 
@@ -174,6 +174,14 @@ def find_policy(root: Path, source: str) -> str:
     if names := [name for name in names if not name.startswith(".")]:
         raise InputError(f"no policy {source} in {root / 'runs'}; {name_hint(source if of_run else run, names)}")
     return source
+
+
+def policy_digest(source: str) -> str:
+    """Digest of a policy's files. For a function, whose code is unknown, the digest of its name."""
+    path = Path(source)
+    if path.is_dir():
+        return digest_file(path / JSON)  # it contains the digest of the weights
+    return digest_file(path) if path.is_file() else digest_json(source)
 
 
 def load_policy(source: str | Path, trust: bool = False) -> Policy:
