@@ -92,13 +92,13 @@ def test_a_pause_takes_no_slots(tmp_path: Path) -> None:
 
 
 def test_sources_without_a_lighting_have_the_names_of_their_films(tmp_path: Path, capsys) -> None:
-    for name in ("день.mkv", "ночь.mkv", "a/GX01.mkv", "b/GX01.mkv"):
+    for name in ("день.mkv", "ночь.mkv", "a b.mkv", "a/GX01.mkv", "b/GX01.mkv"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         film(tmp_path / name, views([0, 6, 12, 18]))
-    sources = [SourceConfig(path=name) for name in ("день.mkv", "ночь.mkv", "a/GX01.mkv", "b/GX01.mkv")]
+    sources = [SourceConfig(path=name) for name in ("день.mkv", "ночь.mkv", "a b.mkv", "a/GX01.mkv", "b/GX01.mkv")]
     capture, _, _ = captured(tmp_path, sources)
-    assert list(dict.fromkeys(source.lighting for source in capture.sources)) == ["день", "ночь", "GX01"]
-    assert len({source.name for source in capture.sources}) == 4
+    assert list(dict.fromkeys(source.lighting for source in capture.sources)) == ["день", "ночь", "a_b", "GX01"]
+    assert len({source.name for source in capture.sources}) == 5
     told = capsys.readouterr().err
     assert "a/GX01.mkv and b/GX01.mkv count as filmed under one lighting, 'GX01'" in told and "день" not in told
 

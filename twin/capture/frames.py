@@ -7,6 +7,7 @@ name is `<source>/<index>`, where the index is its position in the whole film, o
 order. *Held-out* frames are never trained on.
 """
 
+import unicodedata
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -266,10 +267,11 @@ def _with_one_camera(kept: KeptFrames) -> KeptFrames:
 
 
 def _default_lighting(root: Path, path: str) -> str:
-    """The lighting of a source without a given one: the specific part of its path, in any script."""
+    """The lighting of a source without a given one: the specific part of its path, with letters of any script."""
     chosen = _specific_part(path, Path(path).name if (root / path).is_dir() else Path(path).stem)
-    kept = "".join("_" if c in ":/\\" or not c.isprintable() else c for c in chosen).strip(". ")
-    return (kept or "source")[: MAX_NAME // 2]
+    composed = unicodedata.normalize("NFC", chosen)  # macOS stores accents apart from their letters
+    kept = "".join(c if c.isalnum() or c in "-_." else "_" for c in composed).strip(".")
+    return (kept or "source")[:MAX_NAME].encode()[: 2 * MAX_NAME].decode(errors="ignore")
 
 
 def _tell_of_shared_lightings(sources: Sequence[SourceConfig], lightings: Sequence[str]) -> None:
