@@ -7,7 +7,7 @@ from twin import commands
 from twin.config import CAMERA_MODELS, MARKER_FAMILIES, SceneConfig
 from twin.config_file import _SECTIONS, load_config
 from twin.errors import InputError
-from twin.ranges import setting_ranges
+from twin.ranges import Range, check_range, setting_ranges
 
 _SOURCE = '[[source]]\npath = "a.mp4"\n'
 _MINIMAL = "metric.camera_height = 1.2\n" + _SOURCE
@@ -150,6 +150,21 @@ def _numbers():
         for key, value in dataclasses.asdict(getattr(config, section)).items():
             if isinstance(value, int | float) and not isinstance(value, bool):
                 yield section, key, value
+
+
+@pytest.mark.parametrize(
+    ("value", "told"),
+    [
+        (10**400, "steps = 1000"),
+        (float("nan"), "steps = nan"),
+        (True, "steps = True"),
+        ("9", "steps = '9'"),
+        (0, "steps = 0"),
+    ],
+)
+def test_what_is_no_number_in_range_is_told(value: object, told: str) -> None:
+    with pytest.raises(InputError, match=rf"^{told}.*; expected 1 to 10"):
+        check_range(value, Range(1, 10), "steps")
 
 
 def test_every_number_has_a_range_that_is_checked(tmp_path):

@@ -384,7 +384,7 @@ def test_the_next_trials_are_of_policies_that_may_be_best_or_were_not_driven() -
     ranked = [c.policy for c in make_forecast("road", twin, []).candidates]
     assert ranked[0] in first and ranked[-1] in first and sum(name in first for name in ranked) == MIN_POLICIES
     html = forecast_page(made)
-    assert "twin forecast SCENE --real real.csv" in html and again in Text(html).text
+    assert "twin forecast SCENE --real SCENE/real.csv" in html and again in Text(html).text
     assert html.count("<svg") == html.count('<svg role="img" aria-label="') > 0
 
 

@@ -1,5 +1,7 @@
 """Hierarchical rates: exactness in tiny cases, limits, shrinkage, coverage."""
 
+from collections import Counter
+
 import numpy as np
 import pytest
 from intervals import KINDS, Shape, simulate
@@ -106,7 +108,7 @@ def test_cells_are_shrunk_towards_their_policy() -> None:
 def test_a_rate_lies_in_its_interval(won: list[list[int]], trials: int, road: bool) -> None:
     rows = [[Cell(f"p{i}", "t", f"d{k}", trials, n) for k, n in enumerate(row)] for i, row in enumerate(won)]
     model = zip(*RateModel.fit(won, np.full(np.shape(won), trials), road=road).interval(), strict=True)
-    for one, row, (low, high) in zip(_rates_over_days(rows, road), won, model, strict=True):
+    for one, row, (low, high) in zip(_rates_over_days(rows, Counter(), road), won, model, strict=True):
         assert one.value == pytest.approx(np.mean(row) / trials) and one.low <= one.value <= one.high
         assert one.low <= low and one.high >= high  # the interval is only widened
 

@@ -91,7 +91,7 @@ def test_nothing_leaks():
             assert not [name for name in names if f"{module}.{name}".startswith("twin.reality")], path
 
 
-FOUNDATIONS = {"errors", "types", "files", "robot", "config", "runtime", "warp_runtime", "geometry"}
+FOUNDATIONS = {"errors", "types", "ranges", "files", "robot", "config", "runtime", "warp_runtime", "geometry"}
 """Rooms of `twin` below the pipeline: files, messages, settings, geometry of cameras."""
 TABLES = {"evaluation", "evaluation.trials", "evaluation.statistics"}
 """The format of tables of trials."""

@@ -249,7 +249,7 @@ def test_the_verb_writes_a_page_that_needs_nothing_else(fresh):
     assert json.loads((folder / "summary.json").read_text()) == said
     assert list(said["training"]) == ["ahead"]  # the other does not say how it was trained
     assert rate_text(rate_summary(39, 40)) in shown.text and "How the policies were trained" in shown.text
-    assert f"twin forecast {fresh} --real real.csv" in shown.text and "ahead,ahead,LIGHTING" in shown.text
+    assert f"twin forecast {fresh} --real {fresh}/real.csv" in shown.text and "ahead,ahead,LIGHTING" in shown.text
     assert html.count("<svg") == html.count('<svg role="img" aria-label="') > 0
 
 

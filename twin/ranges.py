@@ -44,7 +44,8 @@ def check_range(value: Any, bounds: Range, what: str) -> None:
     if not (number and bounds.low <= value <= bounds.high):
         low, high = f"{bounds.low:,.10g}", f"{bounds.high:,.10g}"
         expected = f"at least {low}" if bounds.high == math.inf else f"{low} to {high}"
-        raise InputError(f"{what} = {f'{value:,.10g}' if number else short_repr(value)}; expected {expected}")
+        short = number and abs(value) < 1e15  # a huge integer is no float
+        raise InputError(f"{what} = {f'{value:,.10g}' if short else short_repr(value)}; expected {expected}")
 
 
 def _leaves(value: Any) -> Iterator[Any]:
