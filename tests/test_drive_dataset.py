@@ -3,6 +3,7 @@
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from twin.env.episode import Episode
 from twin.errors import InputError
 from twin.files import read_json
+from twin.report import drive_dataset
 from twin.report.drive_dataset import CAMERA, DriveDataset, read_drives
 from twin.report.video_writer import read_frames
 
@@ -64,6 +66,19 @@ def written(tmp_path_factory) -> tuple[Path, list]:
 
 def table(folder: Path, name: str) -> dict[str, list]:
     return parquet.read_table(folder / name).to_pydict()
+
+
+def test_a_bags_pictures_are_those_that_had_arrived() -> None:
+    """A policy acts on a picture when it arrives, 90 ms after its exposure."""
+    shutter = np.arange(4) * 100_000_000
+    recording = SimpleNamespace(
+        shutter=shutter,
+        arrival=shutter + 90_000_000,
+        rectified=lambda stamps, _: ((stamp, f"picture {stamp // 10**8}") for stamp in stamps.tolist()),
+    )
+    at = np.array([50, 100, 189, 190, 390]) * 1_000_000
+    names = drive_dataset._pictures_at(recording, None, at)
+    assert names == ["picture 0", "picture 0", "picture 0", "picture 1", "picture 3"]
 
 
 def test_frames_pair_each_picture_with_the_action_that_followed(written):

@@ -120,6 +120,7 @@ def test_csv_and_npz_are_the_same_log(drive, tmp_path):
     [
         ("", "no row of numbers"),
         ("time,x\n", "no row of numbers"),
+        ("time;x\n0;1\n", "its columns are separated by ';', not by commas"),
         ("time,x,,x,\n0,1,,2,\n", "column x appears 2 times"),
     ],
 )

@@ -313,7 +313,7 @@ def test_share_of_a_mixture_is_from_0_to_1(share):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("name", RESERVED_LIGHTINGS)
+@pytest.mark.parametrize("name", [*RESERVED_LIGHTINGS, "drawn_3"])
 def test_reserved_names_are_refused(name):
     with pytest.raises(InputError, match=rf"--name '{name}': reserved"):
         check_new_name(name, ("day",))

@@ -23,6 +23,7 @@ from twin.learn.policy import load_policy
 from twin.learn.policy_evaluation import EpisodeResult, run_episodes
 from twin.learn.selection import FRESH_EPISODES, TESTS_FILE, Failure, PolicyTest, next_segment, train_until_learnt
 from twin.learn.train_config import TrainConfig, steps_for
+from twin.train import _summary
 
 CONFIG = replace(SHORT, steps=160, save_every=160, checkpoints=8, test_every=40, settle=40)
 PLAN = TrainConfig(steps=24_000, test_every=2_000, settle=2_000, cycle=12_000, success=0.95)
@@ -272,6 +273,22 @@ def test_the_last_test_of_a_training_in_one_lighting_is_called_what_it_is(scene,
     """Weather and objects are not randomized there, as they are under `day+randomised`."""
     choice = learn(scene, tmp_path, replace(CONFIG, steps=40, **changes))
     assert choice["chosen"]["condition"] == text
+
+
+@pytest.mark.parametrize(
+    ("why", "reached", "said"),
+    [
+        ("steps", True, "a test reached the required success rate of 95%"),
+        ("steps", False, "stayed below the required success rate of 95%; give more --steps"),
+        ("no better", False, "tests got no better"),
+    ],
+)
+def test_the_printed_end_of_a_training_is_what_was_reached(monkeypatch, why, reached, said):
+    """The last allowed steps may bring the required rate."""
+    monkeypatch.setattr("twin.learn.teacher.teacher_result", lambda _: {"successes": 20, "trials": 20})
+    chosen = {"step": 24000, "successes": 40, "trials": 40, "condition": "held-out"}
+    choice = {"steps": 24000, "why": why, "reached": reached, "success": 0.95, "chosen": chosen, "failures": ""}
+    assert said in _summary(Path("runs/first"), choice, Path("curve.png"))[0]
 
 
 def test_failures_are_summed_up_by_place_cause_and_light():

@@ -665,6 +665,19 @@ def test_another_page_does_not_end_a_comparison(page, monkeypatch):
     _wait(lambda: film.index is None)
 
 
+def test_a_comparison_without_frames_changes_nothing(page, monkeypatch):
+    """As in a pack."""
+    film, chosen = page.film, []
+    monkeypatch.setattr(film, "_cameras", replace(film._cameras, images=Path("absent")))
+    monkeypatch.setattr(film._lighting, "choose", chosen.append)
+    film._read_frame.cache_clear()
+    with pytest.raises(InputError, match="there is no frame .*: packs have none; view the built scene"):
+        film._read_frame(0)
+    film._compare.value = True
+    _wait(lambda: not film._compare.value)
+    assert film.index is None and chosen == []
+
+
 def test_a_flight_ends_in_the_lighting_of_before_or_in_the_one_chosen_meanwhile(page, field, monkeypatch):
     viewer, panel, client = page.viewer, page._path, _Client()
     monkeypatch.setattr(viewer, "clients", lambda: [client])
