@@ -671,7 +671,7 @@ def test_a_comparison_without_frames_changes_nothing(page, monkeypatch):
     monkeypatch.setattr(film, "_cameras", replace(film._cameras, images=Path("absent")))
     monkeypatch.setattr(film._lighting, "choose", chosen.append)
     film._read_frame.cache_clear()
-    with pytest.raises(InputError, match="there is no frame .*: packs have none; view the built scene"):
+    with pytest.raises(InputError, match=r"there is no frame .*: packs have none; view the built scene"):
         film._read_frame(0)
     film._compare.value = True
     _wait(lambda: not film._compare.value)

@@ -155,7 +155,8 @@ def _field_files(
         views_of_one = render_views(field, cameras, gltf.VIEWS, gltf.WIDTH, gltf.FAR, lighting, f"textures, {lighting}")
         frames = gltf.filmed_frames(cameras, lighting)
         write_bytes(glb, gltf.textured_glb(mesh["vertices"].astype(np.float64), mesh["faces"], views_of_one, frames))
-        lines.append(f"{glb}: {len(mesh['faces'])} faces with colors of {lighting}: {len(frames)} frames; y up [m]")
+        source = f"the field and {len(frames)} frames" if frames else "the field"
+        lines.append(f"{glb}: {len(mesh['faces'])} faces, textured under {lighting} from {source}, y up [m]")
     return lines
 
 
