@@ -100,7 +100,7 @@ class SourceConfig:
     path: str = ""
     """Path of a video, robot's bag, image folder, COLMAP model or transforms.json, relative to the scene folder."""
     lighting: str = ""
-    """Name of the lighting, not one of `RESERVED_LIGHTINGS`; by default the file's stem."""
+    """Name of the lighting, not one of `RESERVED_LIGHTINGS`; by default the file's stem, with "_" for spaces."""
     kind: str = "auto"
     """auto, video, bag, images, colmap or transforms."""
     topic: str = ""
