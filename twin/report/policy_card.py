@@ -15,8 +15,8 @@ from twin.evaluation.forecasting import Candidate, Forecast
 from twin.evaluation.statistics import CONFIDENCE, rate_summary
 from twin.evaluation.training_curves import CHOICE_FILE, validated_digests
 from twin.evaluation.trials import Cell, tally, trials_so_far
-from twin.files import digest_file, exists, read_json, wrap_read_errors, write_text
-from twin.learn.policy import JSON, Policy, load_policy
+from twin.files import exists, read_json, wrap_read_errors, write_text
+from twin.learn.policy import JSON, Policy, load_policy, policy_digest
 from twin.report.forecast_text import format_estimate
 from twin.scene import SceneDir
 
@@ -44,7 +44,7 @@ def write_policy_cards(scene: SceneDir, runs: Iterable[str]) -> list[Path]:
         if not exists(folder / JSON):
             continue
         # If the run was trained further after its validation, the results belong to an earlier policy and are left out.
-        same = digest_file(folder / JSON) == digests.get(run)
+        same = policy_digest(str(folder)) == digests.get(run)
         mine = [cell for cell in cells if same and cell.policy == run]
         known = [one for one in forecast.candidates if same and one.policy == run] if forecast else []
         path = folder / CARD
