@@ -298,25 +298,52 @@ def test_a_running_node_refuses_other_parameters(rig):
     assert all(node.describe_parameter(name).read_only for name in ("timeout", "stamped", "deadman_button", "policy"))
 
 
+def launch_file(monkeypatch, **arguments: str) -> tuple[dict[str, Any], list[str]]:
+    """Defaults of the launch file's arguments, and the options it gives the node with these arguments."""
+    at: dict[str, Any] = {}
+    names = [f"launch{part}" for part in ("", ".actions", ".substitutions", "_ros", "_ros.actions")]
+    for name in ("ament_index_python", "ament_index_python.packages", *names):
+        monkeypatch.setitem(sys.modules, name, MagicMock())
+    sys.modules["ament_index_python.packages"].get_package_share_directory = lambda _: str(ROOT)
+    declare = sys.modules["launch.actions"].DeclareLaunchArgument
+    declare.side_effect = lambda name, default_value, description: at.__setitem__(name, default_value)
+    # Arguments are declared before they are used.
+    sys.modules["launch.substitutions"].LaunchConfiguration = lambda name: arguments.get(name, at[name])
+    runpy.run_path(str(ROOT / "launch" / "twin_policy.launch.py"))["generate_launch_description"]()
+    given = sys.modules["launch_ros.actions"].Node.call_args.kwargs
+    file, values = given["parameters"]
+    options = ["-r", f"__ns:={given['namespace']}", "--params-file", file]
+    options += [word for item in values.items() for word in ("-p", ":=".join(item))]
+    return at, options + [word for pair in given["remappings"] for word in ("-r", ":=".join(pair))]
+
+
 @pytest.mark.slow
-def test_it_drives_and_stops_across_the_middleware(tmp_path):
-    """The node runs in a process of its own; pictures and the switch come from this one, 10 times a second."""
+def test_it_drives_and_stops_across_the_middleware(monkeypatch, tmp_path):
+    """The node runs in a process of its own with the launch file's options, on a robot with a namespace; pictures and
+    the switch come from this process, 10 times a second.
+    """
     rclpy = pytest.importorskip("rclpy", reason="ROS 2 is not installed")
+    from diagnostic_msgs.msg import DiagnosticArray
     from geometry_msgs.msg import TwistStamped
     from sensor_msgs.msg import CameraInfo, Image
     from std_msgs.msg import Bool
 
     small_policy(tmp_path)
     # Limits that hold beside other programs, too.
-    given = (f"policy:={tmp_path}", "timeout:=1.0", "inference:=1.0", "deadman:=1.0")
-    main = [sys.executable, "-c", "from twin_policy.node import main; main()", "--ros-args"]
+    given = ("timeout:=1.0", "inference:=1.0", "deadman:=1.0")
+    default, options = launch_file(monkeypatch, policy=str(tmp_path), namespace="/a200_0000")
+    main = [sys.executable, "-c", "from twin_policy.node import main; main()", "--ros-args", *options]
     process = subprocess.Popen([*main, *(word for one in given for word in ("-p", one))])
     rclpy.init()
-    client = rclpy.create_node("client")
+    client = rclpy.create_node("client", namespace="/a200_0000")
     speeds: list[float] = []
-    client.create_subscription(TwistStamped, "cmd_vel", lambda sent: speeds.append(sent.twist.linear.x), 50)
+    reports: list[str] = []
+    client.create_subscription(TwistStamped, default["cmd_vel"], lambda sent: speeds.append(sent.twist.linear.x), 50)
+    client.create_subscription(
+        DiagnosticArray, "diagnostics", lambda sent: reports.extend(one.message for one in sent.status), 50
+    )
     kinds = {"image": Image, "camera_info": CameraInfo, "deadman": Bool}
-    topics = {name: client.create_publisher(kind, name, 1) for name, kind in kinds.items()}
+    topics = {name: client.create_publisher(kind, default.get(name, name), 1) for name, kind in kinds.items()}
 
     def play(seconds: float, shown: bool, held: bool, until: Any = lambda: False) -> None:
         end = time.monotonic() + seconds
@@ -345,6 +372,7 @@ def test_it_drives_and_stops_across_the_middleware(tmp_path):
         speeds.clear()
         play(1.0, shown=True, held=False)
         assert speeds == []  # another source may drive
+        assert any(report.startswith("drives") for report in reports)
         process.send_signal(signal.SIGINT)
         assert process.wait(20.0) == 0
     finally:
@@ -377,14 +405,9 @@ def test_the_yaml_names_every_parameter_of_the_node_with_its_default():
 
 def test_the_launch_file_requires_the_policy_and_nothing_else(monkeypatch):
     """As it replaces the parameter file's policy, a default would replace it by none."""
-    for name in ("ament_index_python", "launch", "launch.actions", "launch.substitutions", "launch_ros"):
-        monkeypatch.setitem(sys.modules, name, MagicMock())
-    monkeypatch.setitem(sys.modules, "launch_ros.actions", MagicMock())
-    monkeypatch.setitem(sys.modules, "ament_index_python.packages", MagicMock(get_package_share_directory=str))
-    runpy.run_path(str(ROOT / "launch" / "twin_policy.launch.py"))["generate_launch_description"]()
-    declared = sys.modules["launch.actions"].DeclareLaunchArgument.call_args_list
-    assert [one.args[0] for one in declared if one.kwargs["default_value"] is None] == ["policy"]
-    assert ("/diagnostics", "diagnostics") in sys.modules["launch_ros.actions"].Node.call_args.kwargs["remappings"]
+    default, options = launch_file(monkeypatch, policy="/data/first")
+    assert [name for name, value in default.items() if value is None] == ["policy"]
+    assert {"policy:=/data/first", "__ns:=", "/diagnostics:=diagnostics"} <= set(options)
 
 
 def test_the_package_is_one_for_colcon():
