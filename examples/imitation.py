@@ -7,8 +7,7 @@
 The last command drives by `act`, with the weights in `imitation.safetensors`.
 """
 
-import argparse
-import functools
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -21,44 +20,34 @@ from twin.report.drive_dataset import read_drives
 WEIGHTS = Path(__file__).with_name("imitation.safetensors")
 STACK = 4  # pictures that a policy sees, the newest last
 
-
-def network() -> nn.Module:
-    eyes = [nn.Conv2d(3 * STACK, 32, 5, 4), nn.ReLU(), nn.Conv2d(32, 32, 3, 2), nn.ReLU(), nn.AdaptiveAvgPool2d((4, 8))]
-    return nn.Sequential(*eyes, nn.Flatten(), nn.Linear(1024, 64), nn.ReLU(), nn.Linear(64, 2), nn.Tanh())
-
-
-@functools.cache
-def trained() -> nn.Module:
-    load_model(model := network(), WEIGHTS)
-    return model
+torch.manual_seed(0)
+EYES = [nn.Conv2d(3 * STACK, 32, 5, 4), nn.ReLU(), nn.Conv2d(32, 32, 3, 2), nn.ReLU(), nn.AdaptiveAvgPool2d((4, 8))]
+MODEL = nn.Sequential(*EYES, nn.Flatten(), nn.Linear(1024, 64), nn.ReLU(), nn.Linear(64, 2), nn.Tanh())
 
 
-@torch.no_grad()
 def act(pixels: np.ndarray) -> np.ndarray:
     """Speed and yaw rate as an action in [-1, 1], shape (2,), from a stack of four pictures (12, height, width)."""
-    return trained()(torch.as_tensor(pixels[None]).float() / 255.0 - 0.5)[0].numpy()
+    return MODEL(torch.as_tensor(pixels[None]).float() / 255.0 - 0.5)[0].detach().numpy()
 
 
 def train(dataset: Path, steps: int = 2000) -> None:
     pictures, actions, frame = (torch.as_tensor(values) for values in read_drives(dataset))
-    pictures = pictures.permute(0, 3, 1, 2)
-    model, generator = network(), torch.Generator().manual_seed(0)
-    optimizer = torch.optim.Adam(model.parameters(), 1e-3)
+    optimizer = torch.optim.Adam(MODEL.parameters(), 1e-3)
     for step in range(steps):
-        some = torch.randint(len(actions), (64,), generator=generator)
+        some = torch.randint(len(actions), (64,))
         # At the start of a drive, the stack has the first picture several times, as in the environment.
         stack = [pictures[some - frame[some].clamp(max=back)] for back in reversed(range(STACK))]
-        loss = (model(torch.cat(stack, 1).float() / 255.0 - 0.5) - actions[some]).square().mean()
+        seen = torch.cat(stack, -1).permute(0, 3, 1, 2).float() / 255.0 - 0.5
+        loss = (MODEL(seen) - actions[some]).square().mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
         if step % 200 == 0 or step == steps - 1:
             print(f"step {step}: mean squared error {loss.item():.4f}")
-    save_model(model, WEIGHTS)
+    save_model(MODEL, WEIGHTS)
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("dataset", type=Path)
-    parser.add_argument("--steps", type=int, default=2000)
-    train(**vars(parser.parse_args()))
+    train(Path(sys.argv[1]))
+elif WEIGHTS.exists():
+    load_model(MODEL, WEIGHTS)

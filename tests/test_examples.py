@@ -39,9 +39,8 @@ def test_ppo_learns_and_is_evaluated(scene, tmp_path, capsys):
 
 
 def test_sac_learns(scene, tmp_path, capsys):
-    root, out = str(scene), tmp_path / "sac.safetensors"
-    options = ["--task", "ahead", "--steps", "120", "--warmup", "100", "--batch", "8", "--out", str(out)]
-    example("sac").main([root, *options])
+    out = tmp_path / "sac.safetensors"
+    example("sac").learn(scene, "ahead", steps=120, warmup=100, batch=8, out=out)
     assert " after " in capsys.readouterr().out and out.exists()
 
 
