@@ -637,7 +637,7 @@ def test_an_early_visitor_reads_that_the_scene_is_being_loaded(scene, monkeypatc
     page = open_page(scene, port=0, announce=lambda url: early.append(sent()))
     try:
         assert "The scene is being loaded" in early[0] and "dark_mode=True" in early[0]
-        assert "The scene is being loaded" not in sent()
+        assert "'visible': False" in sent() and "GuiRemoveMessage" not in sent()
     finally:
         page.viewer.close()
 

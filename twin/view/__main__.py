@@ -149,7 +149,8 @@ def open_page(
         field = twin.field()
         shown: EpisodeLighting = named_lighting(field, lighting or field.lightings[0])
         page = Page(twin, field, server, shown)
-        loading.remove()
+        # Not removed: a browser that gets text and removal in one batch would still set the text, and report an error.
+        loading.visible = False
         return page
     except BaseException:
         server.stop()
