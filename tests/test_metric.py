@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from twin.capture import metric
+from twin.capture import metric, sfm
 from twin.capture.capture_data import Capture, SourceInfo
 from twin.capture.gravity import find_road, up_from_ground
 from twin.capture.scale import (
@@ -346,9 +346,11 @@ def test_gps_that_does_not_spread_is_refused(tmp_path: Path) -> None:
     world = _world(tmp_path / "s", [film], _points(film, rng), _similarity(2), gps=_to_gps(rng.normal(0, 5, (20, 3))))
     with pytest.raises(InputError, match=r"metric.gps: positions fit within"):
         world.run(tmp_path / "out", gps=True)
-    none = _world(tmp_path / "n", [film], _points(film, rng), _similarity(2))
-    with pytest.raises(InputError, match=r"0 registered frames have a position \(need 3\)"):
-        none.run(tmp_path / "out", gps=True)
+    two = np.full((20, 3), np.nan)
+    two[:2] = 47.0
+    few = _world(tmp_path / "few", [film], _points(film, rng), _similarity(2), gps=two)
+    with pytest.raises(InputError, match=r"2 frames have a position \(need 3\)"):
+        few.run(tmp_path / "out", gps=True)
 
 
 @pytest.mark.parametrize("on_ground", [True, False])
@@ -568,16 +570,22 @@ def test_up_from_cameras(tmp_path: Path) -> None:
 
 
 def test_invalid_settings_are_refused_in_one_line(tmp_path: Path) -> None:
+    """Already by the stage before, which takes minutes."""
     film = _path(count=10)
     world = _world(tmp_path / "s", [film], _points(film, np.random.default_rng(0)), _similarity(0))
     cases: list[tuple[dict, str]] = [
         ({"poses_are_metric": True}, "the input has no poses"),
         ({"camera_height": 1.0, "up": "poses"}, "the input has no poses"),
+        ({"odometry": True}, "no source is a bag with odometry"),
+        ({"gps": True}, r"0 frames have a position \(need 3\)"),
     ]
     for changes, text in cases:
-        with pytest.raises(InputError, match=text) as error:
-            world.run(tmp_path / "out", **changes)
-        assert "\n" not in str(error.value)
+        config = SceneConfig(metric=MetricConfig(**changes))
+        for run in (sfm.run, metric.run):
+            with pytest.raises(InputError, match=text) as error:
+                run(world.scene, config, tmp_path)
+            assert "\n" not in str(error.value)
+    assert not (tmp_path / "work").exists()  # no camera was looked for
 
 
 def test_poses_stay_rigid(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from twin.capture.scale import (
     scale_from_marker,
     scale_from_odometry,
 )
-from twin.config import SceneConfig
+from twin.config import MetricConfig, SceneConfig
 from twin.errors import InputError
 from twin.files import write_json
 from twin.geometry.cameras import Cameras, SparsePoints
@@ -48,10 +48,9 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     cameras, points = Cameras.load(scene.stage("cameras")), SparsePoints.load(scene.stage("cameras"))
     capture = Capture.load(scene.stage("capture"))
     given = config.metric
+    check_measured(capture, given)
     heights = {source.name: source.camera_height for source in capture.sources}
-    if given.poses_are_metric and capture.camera_to_world is None:
-        raise InputError("metric.poses_are_metric: the input has no poses; give metric.camera_height or another scale")
-    up, road = _find_up(cameras, points.xyz, given.up, capture)
+    up, road = _find_up(cameras, points.xyz, given.up)
     level, floor_source = _ground_level(cameras, points.xyz, up.direction, road)
     east: Array | None = None
     scales: dict[str, Scale] = {}
@@ -64,11 +63,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     if given.gps:
         rng = np.random.default_rng(config.seed)
         scales["gps"], east = scale_from_gps(cameras, up.direction, capture.gps[rows], rng)
-    if given.odometry:
-        if capture.odometry is None:
-            raise InputError(
-                "metric.odometry: no source is a bag with odometry; give metric.camera_height or another scale"
-            )
+    if given.odometry and capture.odometry is not None:
         scales["odometry"] = scale_from_odometry(cameras, capture.odometry[rows], given.odometry_tolerance)
     if given.marker is not None:
         scales["marker"] = scale_from_marker(cameras, given.marker)
@@ -91,7 +86,24 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     return metrics
 
 
-def _find_up(cameras: Cameras, points: Array, method: str, capture: Capture) -> tuple[Gravity, Road | None]:
+def check_measured(capture: Capture, given: MetricConfig) -> None:
+    """Raises InputError: a scale or a vertical is wanted that the films and photos do not have, whatever their cameras.
+
+    Stage `cameras` calls this first, since it takes minutes.
+    """
+    other = "give metric.camera_height or another scale"
+    if capture.camera_to_world is None and given.poses_are_metric:
+        raise InputError(f"metric.poses_are_metric: the input has no poses; {other}")
+    if capture.camera_to_world is None and given.up == "poses":
+        raise InputError('metric.up = "poses": the input has no poses; use "ground" or "cameras"')
+    if given.odometry and capture.odometry is None:
+        raise InputError(f"metric.odometry: no source is a bag with odometry; {other}")
+    positions = int(np.isfinite(capture.gps[:, :2]).all(1).sum())
+    if given.gps and positions < 3:
+        raise InputError(f"metric.gps: {positions} frames have a position (need 3); {other}")
+
+
+def _find_up(cameras: Cameras, points: Array, method: str) -> tuple[Gravity, Road | None]:
     if method == "ground":
         return up_from_ground(cameras.camera_to_world, points, cameras.sources)
     if method == "cameras":
@@ -99,8 +111,6 @@ def _find_up(cameras: Cameras, points: Array, method: str, capture: Capture) -> 
         tilt = np.arccos(np.clip(-cameras.camera_to_world[:, :3, 1] @ up, -1.0, 1.0))
         gravity = Gravity(up, float(np.sqrt(np.mean(tilt**2)) / np.sqrt(min(len(cameras), 10))), "cameras")
     else:
-        if capture.camera_to_world is None:
-            raise InputError('metric.up = "poses": the input has no poses; use "ground" or "cameras"')
         if (tilt := np.degrees(np.arccos(np.clip(camera_up(cameras.camera_to_world)[2], -1.0, 1.0)))) > _MAX_UP_TILT:
             raise InputError(
                 f'metric.up = "poses": the cameras\' mean up axis is {tilt:.0f}° off the z axis of the given poses; '

@@ -41,6 +41,7 @@ from twin.capture.matching import (
     probe_pairs,
     sequence_pairs,
 )
+from twin.capture.metric import check_measured
 from twin.capture.pair_geometry import estimate_focal_lengths
 from twin.capture.pose_averaging import check_poses, near_in_film
 from twin.capture.rolling_shutter import RollingShutter, correct_model, corrected_map, corrected_pinhole
@@ -71,10 +72,12 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
 
     Returns metrics, see `_metrics`.
 
-    Raises InputError: too little texture or overlap, or a fraction of registered frames below `cameras.min_registered`.
+    Raises InputError: too little texture or overlap, a fraction of registered frames below `cameras.min_registered`, or
+    nothing that could tell the wanted scale (`metric.check_measured`).
     """
     stage, settings = scene.stage("capture"), config.cameras
     capture = Capture.load(stage)
+    check_measured(capture, config.metric)
     work = out / "work"
     work.mkdir()
     threads = min(runtime.available_cores(), _MAX_THREADS)
