@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from twin import commands, runtime
-from twin.config import MetricConfig, NerfConfig, RouteConfig, SceneConfig
+from twin.config import RouteConfig, SceneConfig
 from twin.config_file import load_config
 from twin.errors import InputError, join_names
 from twin.files import digest_file, digest_json, is_folder, is_link, remove, write_json
@@ -47,12 +47,12 @@ PIPELINE = (
     Stage("field", "twin.nerf.trainer", 11, ("nerf", "mjcf.route"), ("cameras", "metric")),
     Stage("mesh", "twin.assets.mesh", 8, ("mesh", "route", "branch", *_MJCF_OF_MESH), ("cameras", "metric", "field")),
     # It also reads `route` and `branch`; if these change, so does the result of `mesh`.
-    Stage("mjcf", "twin.mjcf.scene_xml", 5, ("mjcf", "robot"), ("metric", "mesh")),
+    Stage("mjcf", "twin.mjcf.scene_xml", 5, ("name", "mjcf", "robot"), ("metric", "mesh")),
     Stage(
         "review",
         "twin.report.review_video",
         5,
-        ("review", "mjcf.route"),
+        ("name", "review", "mjcf.route"),
         ("cameras", "metric", "field", "mesh", "mjcf"),
     ),
 )
@@ -114,7 +114,11 @@ def build(
                 if stage.name == "field":
                     _check_routes(scene, config)
                 done = {name: it.seconds for name, it in stamps.items() if not skipped[name]}
-                changes = ["--force"] if forced else stamp and stamp.depends and _changes(depends, stamp.depends)
+                if stamp is None:
+                    damaged = (scene.stage(stage.name) / "stamp.json").exists()
+                    changes = ["damaged or unreadable files"] if damaged else []
+                else:
+                    changes = ["--force"] if forced else _changes(depends, stamp.depends) if stamp.depends else []
                 _announce(stage, done, until, f", again because of {join_names(changes, 4)}" if changes else "")
                 stamp = _run(stage, scene, config, depends, device)
             stamps[stage.name], skipped[stage.name] = stamp, current
@@ -219,30 +223,10 @@ def _files_below(folder: Path, scene: SceneDir) -> list[Path]:
 
 
 def _depends(stage: Stage, config: SceneConfig, inputs: dict[str, str], stamps: dict[str, Stamp]) -> dict[str, Any]:
-    table = dataclasses.asdict(config)
-    settings: dict[str, Any] = {}
+    table, settings = dataclasses.asdict(config), {}
     for name in stage.config:
         section, _, key = name.partition(".")
         settings[name] = table[section][key] if key else table[section]
-    # Settings that were added later are omitted where they have no effect, so that results of older versions stay
-    # valid.
-    for one in (settings.get("capture", {}), *settings.get("source", ())):
-        for key in ("keep", "topic"):
-            if key in one and not one[key]:
-                del one[key]
-    if settings.get("metric", {}).get("camera_height_tolerance") == MetricConfig.camera_height_tolerance:
-        del settings["metric"]["camera_height_tolerance"]
-    if not settings.get("metric", {}).get("odometry", True):
-        del settings["metric"]["odometry"], settings["metric"]["odometry_tolerance"]
-    if settings.get("route") == dataclasses.asdict(RouteConfig()):
-        del settings["route"]
-    if "branch" in settings and not settings["branch"]:
-        del settings["branch"]
-    if settings.get("nerf", {}).get("section_length") == NerfConfig.section_length:
-        del settings["nerf"]["section_length"]
-    for key in ("refine_cameras", "transients"):
-        if not settings.get("nerf", {}).get(key, True):
-            del settings["nerf"][key]
     return {
         "stage": stage.name,
         "version": stage.version,

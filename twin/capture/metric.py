@@ -21,7 +21,7 @@ from twin.capture.scale import (
     scale_from_marker,
     scale_from_odometry,
 )
-from twin.config import MetricConfig, SceneConfig
+from twin.config import SceneConfig
 from twin.errors import InputError
 from twin.files import write_json
 from twin.geometry.cameras import Cameras, SparsePoints
@@ -48,7 +48,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     cameras, points = Cameras.load(scene.stage("cameras")), SparsePoints.load(scene.stage("cameras"))
     capture = Capture.load(scene.stage("capture"))
     given = config.metric
-    check_measured(capture, given)
+    check_measured(capture, config)
     heights = {source.name: source.camera_height for source in capture.sources}
     up, road = _find_up(cameras, points.xyz, given.up)
     level, floor_source = _ground_level(cameras, points.xyz, up.direction, road)
@@ -86,12 +86,12 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     return metrics
 
 
-def check_measured(capture: Capture, given: MetricConfig) -> None:
+def check_measured(capture: Capture, config: SceneConfig) -> None:
     """Raises InputError: a scale or a vertical is wanted that the films and photos do not have, whatever their cameras.
 
     Stage `cameras` calls this first, since it takes minutes.
     """
-    other = "give metric.camera_height or another scale"
+    given, other = config.metric, "give metric.camera_height or another scale"
     if capture.camera_to_world is None and given.poses_are_metric:
         raise InputError(f"metric.poses_are_metric: the input has no poses; {other}")
     if capture.camera_to_world is None and given.up == "poses":

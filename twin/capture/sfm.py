@@ -77,7 +77,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     """
     stage, settings = scene.stage("capture"), config.cameras
     capture = Capture.load(stage)
-    check_measured(capture, config.metric)
+    check_measured(capture, config)
     work = out / "work"
     work.mkdir()
     threads = min(runtime.available_cores(), _MAX_THREADS)
