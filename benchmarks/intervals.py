@@ -290,7 +290,7 @@ def _rates(worlds: Worlds) -> Hits:
             (twin, worlds.twin[:, 0], worlds.twin_rates()[:, 0], shape.twin_trials),
         ):
             for i, mine in enumerate(won[: _counted(worlds)]):
-                low, high = RateModel.fit(mine, np.full(mine.shape, trials), road=hit is policy).interval()
+                low, high = RateModel.fit(mine, np.full(mine.shape, trials)).interval()
                 hit[i] = (low <= aim[i]) & (aim[i] <= high)
     middling = np.where((true >= 0.1) & (true <= 0.9), policy, np.nan)
     return {"policy": policy.mean(1), "policy, middling": _mean_or_nan(middling), "twin": twin.mean(1)}

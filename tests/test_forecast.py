@@ -109,7 +109,7 @@ def test_ranks_in_the_twin_are_by_the_twins_own_prior() -> None:
     ]
     made = make_forecast("road", twin, [replace(c, trials=5, successes=c.successes // 4) for c in twin])
     won = np.array([[c.successes for c in twin if c.policy == f"p{i}"] for i in range(6)])
-    model = RateModel.fit(won, np.full(won.shape, 20), road=False, shared_days=False)
+    model = RateModel.fit(won, np.full(won.shape, 20), shared_days=False)
     expected = rank_probabilities(model.sample(np.random.default_rng(7), 20_000))
     for one in made.candidates:
         assert one.twin_ranks == pytest.approx(expected[int(one.policy[1:])], abs=0.02)
@@ -192,7 +192,7 @@ def test_the_table_and_the_verdict_agree_on_the_twins_best_policy() -> None:
     assert (first.policy, first.twin.value, second.twin.value) == ("a", pytest.approx(0.7), pytest.approx(0.6))
     assert first.twin_ranks[0] > 0.5
     # The interval knows that only two lightings were seen, although one counts three times.
-    two = RateModel.fit(np.array([[36, 4], [24, 24]]), np.full((2, 2), 40), road=False).interval()
+    two = RateModel.fit(np.array([[36, 4], [24, 24]]), np.full((2, 2), 40)).interval()
     assert (first.twin.low, first.twin.high) == (pytest.approx(two[0][0]), pytest.approx(max(two[1][0], 0.7)))
 
 

@@ -267,13 +267,13 @@ def _candidates(
     rng = np.random.default_rng([seed, 1])
     by_day, days = bool(real) and len(lightings) > 1, _days_by_lighting(real)
     units = [_one_per_day(mine, days) for mine in cells] if by_day else cells
-    ranks = rank_probabilities(_sampled_rates(units, by_day, rng, road=False))
+    ranks = rank_probabilities(_sampled_rates(units, by_day, rng))
     with_real = [i for i, mine in enumerate(driven) if mine]
     real_ranks: dict[int, Array] = {}
     if len(with_real) > 1:
         sampled = _sampled_rates([driven[i] for i in with_real], True, rng)
         real_ranks = dict(zip(with_real, rank_probabilities(sampled), strict=True))
-    twin_rates = _rates_over_days(cells, days, road=False) if by_day else [_mean_rate(mine) for mine in cells]
+    twin_rates = _rates_over_days(cells, days) if by_day else [_mean_rate(mine) for mine in cells]
     real_rates = dict(zip(with_real, _rates_over_days([driven[i] for i in with_real], Counter()), strict=True))
     corrected = _corrected(cells, driven, lightings, {cell.key: cell for cell in twin})
     out = [
@@ -334,15 +334,15 @@ def _scores(real: Sequence[Cell], twin: Cells) -> tuple[float, float]:
     return float(np.mean([twin[c.twin_key].rate for c in real])), float(np.mean([c.rate for c in real]))
 
 
-def _sampled_rates(rows: Sequence[Sequence[Cell]], by_day: bool, rng: np.random.Generator, road: bool = True) -> Array:
-    """Samples of the policies' true rates on the road or in the twin, shape (samples, n).
+def _sampled_rates(rows: Sequence[Sequence[Cell]], by_day: bool, rng: np.random.Generator) -> Array:
+    """Samples of the policies' true rates, shape (samples, n).
 
     Effects of a day on all policies are not modeled, since they hardly change ranks.
     """
-    return RateModel.fit(*unit_counts(rows, by_day), road=road, shared_days=False).sample(rng, SAMPLES)
+    return RateModel.fit(*unit_counts(rows, by_day), shared_days=False).sample(rng, SAMPLES)
 
 
-def _rates_over_days(rows: Sequence[Sequence[Cell]], days: Counter[str], road: bool = True) -> list[Estimate]:
+def _rates_over_days(rows: Sequence[Sequence[Cell]], days: Counter[str]) -> list[Estimate]:
     """Mean rate of each policy's cells over the days, see `_score_over_days`, with an interval over days.
 
     The model counts each cell once, shrinks a policy's rate towards those of the others, and its rates end short of 0
@@ -350,7 +350,12 @@ def _rates_over_days(rows: Sequence[Sequence[Cell]], days: Counter[str], road: b
     """
     if not rows:
         return []
-    low, high = RateModel.fit(*unit_counts(rows, True), road=road).interval()
+    column = {day: k for k, day in enumerate(dict.fromkeys((c.task, c.lighting) for row in rows for c in row))}
+    counts = np.zeros((2, len(rows), len(column)), np.int64)
+    for i, row in enumerate(rows):
+        for cell in row:
+            counts[:, i, column[cell.task, cell.lighting]] = cell.successes, cell.trials
+    low, high = RateModel.fit(*counts).interval()
     out = []
     for i, row in enumerate(rows):
         value, trials = _score_over_days(row, days), sum(c.trials for c in row)
@@ -413,7 +418,7 @@ def _allocation(task: str, twin: Sequence[Cell], real: Sequence[Cell], seed: int
     by_day = on_road or (bool(real) and len({c.lighting for c in twin}) > 1)  # as in `_candidates`
     if by_day and not on_road:
         rows = [_one_per_day(row, _days_by_lighting(real)) for row in rows]
-    rates = _sampled_rates(rows, by_day, np.random.default_rng([seed, 3]), on_road)
+    rates = _sampled_rates(rows, by_day, np.random.default_rng([seed, 3]))
     now = expected_confidence(rates, 0, seed, on_road)
     more = [trials_needed(rates, what, seed, on_road) for what in ("winner", "order")]
     return TrialAllocation(task, len(policies), basis, now.winner, now.order, *more)

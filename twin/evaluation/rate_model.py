@@ -9,22 +9,21 @@ on day j, policy i succeeds yᵢⱼ times:
     logit μᵢ = logit μ + β xᵢ                                        xᵢ: a covariate; the forecast has none
 
 A Beta distribution with mean p and intra-class correlation ρ is Beta(p/ρ − p, (1 − p)/ρ − (1 − p)). With ρ = 1, all
-trials of a day have the same outcome; with ρ = 0, they are independent. τ has a uniform prior, and μ has Jeffreys'. For
-the twin's rates (`road=False`), ρ has a uniform prior. For the road, its prior is Beta(5, 1): on most days, all trials
-of a policy have the same outcome (706 of 720 cells in docs/benchmarks.md). Few days do not suffice to estimate such a
-ρ without this prior: with a uniform one, 90 % intervals from four days had a coverage of 0.79. All policies share ρ.
-All parameters are integrated over a grid, so intervals need neither sampling nor a seed. A policy's rate is shrunk
-towards the rates of the other policies, more strongly if these are alike; it is not shrunk towards one half. The
-beta-binomial distribution is Skellam's (J. R. Stat. Soc. B 10, 1948); for hierarchical models see Gelman et al.,
-Bayesian Data Analysis, section 5.3.
+trials of a day have the same outcome; with ρ = 0, they are independent. The priors are Beta(5, 1) of ρ, since on most
+days all trials of a policy have the same outcome (706 of 720 cells in docs/benchmarks.md), Beta(1, 2) of τ, and
+Beta(3/2, 3/2) of μ. With uniform priors and Jeffreys' prior of μ, all successes on a few days suggested that a policy
+always succeeds: 90 % intervals from two to four days had coverages of 0.74 to 0.83 where weather changes a lot. All
+policies share ρ. All parameters are integrated over a grid, so intervals need neither sampling nor a seed. A policy's
+rate is shrunk towards the rates of the other policies, more strongly if these are alike; it is not shrunk towards one
+half. The beta-binomial distribution is Skellam's (J. R. Stat. Soc. B 10, 1948); for hierarchical models see Gelman et
+al., Bayesian Data Analysis, section 5.3.
 
 Policies of one experiment drive on the same days, and a bad day is bad for all of them. So their cells are not
 independent, and the product of their likelihoods is a *composite* likelihood. It is raised to the power
-(2k − 1) / (2k + 1) for k days (for such scaling see Ribatet, Cooley and Davison, Statistica Sinica 22, 2012). Without
-this power, 90 % intervals from two days had coverages of 0.72 to 0.92. Besides, n − 1 other policies tell less about a
-policy's rate than as many independent ones: their likelihood is raised to the power 1 / (1 + 0.3 (n − 1)), as if the
-outcomes of two policies on one day had a correlation of 0.3. For eight policies on four days of a weather that affects
-all alike, this raises the coverage from 0.71 to 0.83. `sample` does not use this power.
+(2k − 1) / (2k + 1) for k days (for such scaling see Ribatet, Cooley and Davison, Statistica Sinica 22, 2012). Besides,
+n − 1 other policies tell less about a policy's rate than as many independent ones: their likelihood is raised to the
+power 1 / (1 + c (n − 1)), where c is the correlation between two policies' outcomes on one day, as estimated from the
+days driven (`_shared_effect`), but at least 0.3. `sample` does not use this power.
 
 The estimand of `interval` is the rate over the *population* of days like those driven. `cell_means` estimates rates on
 the days that were driven. For the coverage of the intervals see `benchmarks/intervals.py`.
@@ -38,7 +37,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import betainc, betaln, expit, logit
+from scipy.special import betainc, betaincinv, betaln, expit, logit
 
 from twin.evaluation.statistics import CONFIDENCE
 from twin.types import Array
@@ -49,10 +48,12 @@ MIN_RATE_DAYS = 2
 _EDGES = np.concatenate([[0.0], expit(np.linspace(-7.5, 7.5, 47)), [1.0]])
 """Edges of the grid of rates."""
 _RATES = np.concatenate([[_EDGES[1] / 3], expit((logit(_EDGES[1:-2]) + logit(_EDGES[2:-1])) / 2), [1 - _EDGES[1] / 3]])
-_CORRELATIONS = (np.arange(10) + 0.5) / 10  # grid of ρ and τ; values of τ are equally likely
-_SHARED = 0.3  # assumed correlation between two policies' outcomes on one day
-_ROAD_PRIOR = 4.0  # exponent of the density of Beta(5, 1), the prior of ρ
-_MEANS = np.sin(np.pi / 2 * (np.arange(15) + 0.5) / 15) ** 2  # grid of μ: quantiles of Jeffreys' prior Beta(½, ½)
+_CORRELATIONS = (np.arange(10) + 0.5) / 10  # grid of ρ
+_CORRELATION_PRIOR = _CORRELATIONS**4.0  # density of Beta(5, 1) up to a factor
+_ALIKE = 1.0 - np.sqrt(1.0 - (np.arange(10) + 0.5) / 10)  # grid of τ: quantiles of its prior Beta(1, 2)
+_MEANS = betaincinv(1.5, 1.5, (np.arange(15) + 0.5) / 15)  # grid of μ: quantiles of its prior Beta(3/2, 3/2)
+_LEAST_SHARED = 0.3  # least correlation between two policies' outcomes on one day, also its prior mean
+_PRIOR_DAYS = 2.0  # weight of this prior mean, as a number of days on which one more policy drives
 _SLOPES = (0.0, 0.5, 1.0)  # grid of β, equally likely
 
 
@@ -73,8 +74,6 @@ class RateModel:
     """Likelihood of each policy's cells for each h and ρ, shape (n, h, r)."""
     weight: Array
     """Posterior mass of each h and ρ, shape (h, r)."""
-    correlations: Array
-    """Prior mass of each ρ, up to a factor, shape (r,)."""
     power: float
     """Power of the other policies' likelihood in a policy's posterior."""
 
@@ -84,14 +83,12 @@ class RateModel:
         trials: ArrayLike,
         covariate: ArrayLike | None = None,
         shared_days: bool = True,
-        road: bool = True,
     ) -> "RateModel":
         """Fits the counts of n policies in up to k cells, shapes (n, k); cells without trials are padding.
 
         Args:
             covariate: xᵢ [logit], shape (n,); `fit` subtracts its mean; None: no covariate.
-            shared_days: True if the policies drove on the same few days; see the module's docstring.
-            road: True: ρ has the road's prior; False: a uniform one.
+            shared_days: True if column j is the same day for all policies; see the module's docstring.
 
         Raises:
             ValueError: more successes than trials, negative counts, or shapes that differ.
@@ -104,17 +101,16 @@ class RateModel:
         slopes = np.zeros(1) if covariate is None else np.array(_SLOPES)
         given = np.zeros(1) if covariate is None else np.asarray(covariate, float)
         x = given - given.mean()
-        mean, correlation, slope = (a.ravel() for a in np.meshgrid(_MEANS, _CORRELATIONS, slopes, indexing="ij"))
+        mean, correlation, slope = (a.ravel() for a in np.meshgrid(_MEANS, _ALIKE, slopes, indexing="ij"))
         centers = expit(logit(mean) + slope * x[:, None])
         a, b = _beta(np.clip(centers, 1e-4, 1 - 1e-4), correlation)
         prior = np.diff(betainc(a[..., None], b[..., None], _EDGES), axis=-1)
         evidence = np.maximum(np.matmul(prior, likelihood), 1e-300)
         log = np.log(evidence).sum(0)
-        correlations = _CORRELATIONS ** (_ROAD_PRIOR if road else 0.0)
-        weight = np.exp(log - log.max()) * correlations
+        weight = np.exp(log - log.max()) * _CORRELATION_PRIOR
         others = max(int((driven.sum(-1) > 0).sum()) - 1, 0)
-        power = 1.0 / (1.0 + _SHARED * others) if shared_days else 1.0
-        return RateModel(won, driven, likelihood, prior, evidence, weight / weight.sum(), correlations, power)
+        power = 1.0 / (1.0 + _shared_effect(won, driven) * others) if shared_days else 1.0
+        return RateModel(won, driven, likelihood, prior, evidence, weight / weight.sum(), power)
 
     def posterior(self) -> Array:
         """Mass of the grid's rates for each policy, shape (n, g)."""
@@ -124,7 +120,7 @@ class RateModel:
         """Mass of the grid's rates and ρ for each policy, shape (n, g, r)."""
         log = np.log(self.evidence)
         others = self.power * (log.sum(0) - log)
-        scaled = np.exp(others - others.max((1, 2), keepdims=True)) * self.correlations
+        scaled = np.exp(others - others.max((1, 2), keepdims=True)) * _CORRELATION_PRIOR
         prior = np.broadcast_to(self.prior, (len(scaled), *self.prior.shape[1:]))
         mass = np.matmul(np.swapaxes(prior, 1, 2), scaled) * self.likelihood
         return np.asarray(mass / mass.sum((-1, -2), keepdims=True))
@@ -158,6 +154,25 @@ class RateModel:
         won, driven = self.successes[:, :, None, None], self.trials[:, :, None, None]
         means = (_RATES[:, None] * size + won) / (size + driven)
         return np.asarray((joint[:, None] * means).sum((-1, -2)))
+
+
+def _shared_effect(won: Array, driven: Array) -> float:
+    """Correlation between two policies' success rates on one day, from cells (n, k), at least `_LEAST_SHARED`.
+
+    It is the mean over pairs of policies, on the days that both drove, and shrunk towards the prior mean.
+    """
+    mask = driven > 0
+    rate = np.where(mask, won / np.maximum(driven, 1.0), 0.0)
+    off = np.where(mask, rate - rate.sum(1, keepdims=True) / np.maximum(mask.sum(1, keepdims=True), 1), 0.0)
+    together, spread = off @ off.T, off**2 @ mask.T
+    pairs = np.triu_indices(len(off), 1)
+    scale = np.sqrt(spread * spread.T)[pairs].sum()
+    varied = int((np.abs(off).max(1) > 1e-9).sum())
+    if varied < 2 or scale < 1e-9:
+        return _LEAST_SHARED
+    weight = (varied - 1) * (int(mask.any(0).sum()) - 1)
+    found = (_PRIOR_DAYS * _LEAST_SHARED + weight * together[pairs].sum() / scale) / (_PRIOR_DAYS + weight)
+    return float(np.clip(found, _LEAST_SHARED, 1.0))
 
 
 def _beta(mean: Array, correlation: Array) -> tuple[Array, Array]:
