@@ -88,7 +88,7 @@ def twin_probabilities(successes: Array | Indices, trials: Array | Indices) -> A
 
     A cell's probability is its rate, shrunk towards the policy's rate in the twin.
     """
-    return RateModel.fit(successes, trials, shared_days=False).cell_means()
+    return RateModel.fit(successes, trials, shared_days=False, all_or_none=False).cell_means()
 
 
 def shuffled_days(probability: Array, weight: Array, rate: Array, score: Callable[[Array, Array], Array]) -> Array:

@@ -49,7 +49,7 @@ _EDGES = np.concatenate([[0.0], expit(np.linspace(-7.5, 7.5, 47)), [1.0]])
 """Edges of the grid of rates."""
 _RATES = np.concatenate([[_EDGES[1] / 3], expit((logit(_EDGES[1:-2]) + logit(_EDGES[2:-1])) / 2), [1 - _EDGES[1] / 3]])
 _CORRELATIONS = (np.arange(10) + 0.5) / 10  # grid of ρ
-_CORRELATION_PRIOR = _CORRELATIONS**4.0  # density of Beta(5, 1) up to a factor
+_ALL_OR_NONE = 4.0  # exponent of the density of Beta(5, 1), the prior of ρ
 _ALIKE = 1.0 - np.sqrt(1.0 - (np.arange(10) + 0.5) / 10)  # grid of τ: quantiles of its prior Beta(1, 2)
 _MEANS = betaincinv(1.5, 1.5, (np.arange(15) + 0.5) / 15)  # grid of μ: quantiles of its prior Beta(3/2, 3/2)
 _LEAST_SHARED = 0.3  # least correlation between two policies' outcomes on one day, also its prior mean
@@ -74,6 +74,8 @@ class RateModel:
     """Likelihood of each policy's cells for each h and ρ, shape (n, h, r)."""
     weight: Array
     """Posterior mass of each h and ρ, shape (h, r)."""
+    correlations: Array
+    """Prior mass of each ρ, up to a factor, shape (r,)."""
     power: float
     """Power of the other policies' likelihood in a policy's posterior."""
 
@@ -83,12 +85,15 @@ class RateModel:
         trials: ArrayLike,
         covariate: ArrayLike | None = None,
         shared_days: bool = True,
+        all_or_none: bool = True,
     ) -> "RateModel":
         """Fits the counts of n policies in up to k cells, shapes (n, k); cells without trials are padding.
 
         Args:
             covariate: xᵢ [logit], shape (n,); `fit` subtracts its mean; None: no covariate.
             shared_days: True if column j is the same day for all policies; see the module's docstring.
+            all_or_none: True: the prior of ρ expects that all trials of a day have the same outcome; False: it is
+                uniform.
 
         Raises:
             ValueError: more successes than trials, negative counts, or shapes that differ.
@@ -107,10 +112,11 @@ class RateModel:
         prior = np.diff(betainc(a[..., None], b[..., None], _EDGES), axis=-1)
         evidence = np.maximum(np.matmul(prior, likelihood), 1e-300)
         log = np.log(evidence).sum(0)
-        weight = np.exp(log - log.max()) * _CORRELATION_PRIOR
+        correlations = _CORRELATIONS ** (_ALL_OR_NONE if all_or_none else 0.0)
+        weight = np.exp(log - log.max()) * correlations
         others = max(int((driven.sum(-1) > 0).sum()) - 1, 0)
         power = 1.0 / (1.0 + _shared_effect(won, driven) * others) if shared_days else 1.0
-        return RateModel(won, driven, likelihood, prior, evidence, weight / weight.sum(), power)
+        return RateModel(won, driven, likelihood, prior, evidence, weight / weight.sum(), correlations, power)
 
     def posterior(self) -> Array:
         """Mass of the grid's rates for each policy, shape (n, g)."""
@@ -120,7 +126,7 @@ class RateModel:
         """Mass of the grid's rates and ρ for each policy, shape (n, g, r)."""
         log = np.log(self.evidence)
         others = self.power * (log.sum(0) - log)
-        scaled = np.exp(others - others.max((1, 2), keepdims=True)) * _CORRELATION_PRIOR
+        scaled = np.exp(others - others.max((1, 2), keepdims=True)) * self.correlations
         prior = np.broadcast_to(self.prior, (len(scaled), *self.prior.shape[1:]))
         mass = np.matmul(np.swapaxes(prior, 1, 2), scaled) * self.likelihood
         return np.asarray(mass / mass.sum((-1, -2), keepdims=True))
