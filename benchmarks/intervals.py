@@ -325,7 +325,7 @@ def _predicted(worlds: Worlds) -> Hits:
     for i in range(len(out)):
         data = worlds.place(0, i)
         f, y = data.rates()["twin"], data.rates()["real"]
-        if len(f) - np.bincount(data.training).max() < MIN_PREDICTORS:
+        if len(np.unique(data.training)) <= MIN_PREDICTORS:
             break
         try:
             _, low, high = leave_one_group_out(twin=f, real=y, groups=data.training.tolist())

@@ -132,7 +132,7 @@ def test_rates_are_those_of_the_tables() -> None:
     for name, _, _ in STATISTICS[:-1]:
         estimate = getattr(group, name)
         if name == "corrected_coverage":
-            assert "7 policies of other trainings on its task" in estimate.missing
+            assert "policies of 7 other trainings on its task" in estimate.missing
             continue
         assert estimate.value is not None and estimate.n > 0
         assert estimate.low is estimate.high is None  # seven trainings on two days
@@ -237,7 +237,7 @@ def test_a_task_with_too_few_trials_leaves_the_verdicts_on_the_others() -> None:
     assert [g.task for g in made.groups] == ["easy", "hard"]
     said = [v.text for v in verdicts(made)]
     assert "Spearman" in said[1] and "on easy" in said[1]
-    assert said[-1].startswith("Too few real trials to say how well the twin predicts hard: each cell needs 5 trials")
+    assert said[-1].startswith("Too few data to say how well the twin predicts hard: each cell needs 5 real trials")
 
 
 def test_a_group_of_all_tasks_combines_those_of_the_tasks() -> None:
@@ -338,10 +338,10 @@ def test_no_correlation_from_cells_of_fewer_than_five_trials() -> None:
     twin, real = cells()
     real[3] = Cell("p1", "straight", "sun", 4, 1, "sun")
     told = refused(make_forecast("road", twin, real))
-    assert "p1 under sun has 4 real trials (1 more)" in told and "p2" not in told
+    assert "needs 5 real trials, but p1 under sun has 4" in told and "p2" not in told
     twin, real = cells()
     twin[0] = Cell("p0", "straight", "held-out", 3, 0)
-    assert "p0 under held-out has 3 trials in the twin (2 more)" in refused(make_forecast("road", twin, real))
+    assert "5 episodes in the twin, but p0 under held-out has 3" in refused(make_forecast("road", twin, real))
 
 
 def test_rates_that_are_all_the_same_have_no_correlation_but_a_bias() -> None:
@@ -686,3 +686,66 @@ def test_words_in_tables_stay_whole_on_a_narrow_screen():
 def test_one_is_singular():
     html = forecast_page(make_forecast("road", [Cell("p0", "straight", "sun", 1, 1)], []))
     assert "1 policy on one task: 1 trial in the twin, 0 on the road." in html
+
+
+# ---- what the words may claim
+
+
+def on_days(real: dict[str, list[int]], twin: dict[str, int], trials: int = 5) -> tuple[list[Cell], list[Cell]]:
+    """Successes of each policy on each day, of `trials`, and in 100 episodes in the twin."""
+    road = [
+        Cell(p, "straight", f"d{k}", trials, won, "held-out") for p, each in real.items() for k, won in enumerate(each)
+    ]
+    return [Cell(p, "straight", "held-out", 100, won) for p, won in twin.items()], road
+
+
+def test_pairs_that_are_equal_on_the_road_are_told_and_not_good_news() -> None:
+    """One of twelve policies never arrives, the others always, whatever the twin says of them."""
+    real = {f"p{i}": [5 * (i > 0)] * 5 for i in range(12)}
+    twin, road = on_days(real, {f"p{i}": 5 + 8 * i for i in range(12)})
+    made = make_forecast("road", twin, road)
+    assert made.groups[0].tied_pairs == 55
+    first = verdicts(made)[0]
+    assert "11 of 11 such pairs" in first.text and "55 further pairs had the same rate on the road" in first.text
+    assert first.mood == "mixed"
+    assert "those of 55 further pairs do not" in Text(forecast_page(made)).text
+
+
+def test_a_prediction_interval_needs_other_trainings_and_not_more_checkpoints() -> None:
+    def made(names: list[str]) -> Forecast:
+        rng = np.random.default_rng(0)
+        rates = {name: round(5 + 85 * k / len(names)) for k, name in enumerate(names)}
+        real = {name: rng.binomial(5, rates[name] / 100, 5).tolist() for name in names}
+        return make_forecast("road", *on_days(real, rates))
+
+    few = made([f"r{i % 2}/{i:09d}" for i in range(16)])
+    assert all("1 other trainings, 7 are needed" in c.corrected.no_interval for c in few.candidates)
+    assert few.groups[0].corrected_coverage.missing
+    many = made([f"r{i}" for i in range(9)])
+    assert all(c.corrected.low is not None for c in many.candidates)
+    assert many.groups[0].corrected_coverage.n == 9
+
+
+def test_a_mean_beyond_one_is_not_printed() -> None:
+    real = {f"p{i}": [round(0.1 * (i + 1) * 5)] * 5 for i in range(8)}
+    twin, road = on_days(real, {f"p{i}": 5 * (i + 1) for i in range(8)} | {f"n{i}": 95 for i in range(32)})
+    assert "are unlike those driven" in make_forecast("road", twin, road).groups[0].mean_real.missing
+
+
+def test_equal_policies_lead_together() -> None:
+    twin = [Cell(f"p{i}", "straight", "sun", 20, 20 if i < 3 else 15) for i in range(4)]
+    assert "“p0”, “p1” and “p2” lead with the same rate" in verdicts(make_forecast("road", twin, []))[-1].text
+
+
+def test_what_to_drive_next_is_named_also_among_many_like_policies() -> None:
+    real = {f"p{i}": [5 if k < 4 or i == 0 else 0 for k in range(5)] for i in range(30)}
+    (line,) = next_trials(make_forecast("road", *on_days(real, {f"p{i}": 80 for i in range(30)})))
+    assert ("probably" not in line and "p0 (" in line and "p1 (" in line) or "each may be the best" in line
+
+
+def test_missing_episodes_of_the_twin_are_not_missing_trials() -> None:
+    twin, road = on_days({f"p{i}": [i % 6] * 4 for i in range(6)}, {f"p{i}": 50 for i in range(6)})
+    few = [replace(cell, trials=4, successes=2) for cell in twin]
+    text = verdicts(make_forecast("road", few, road))[0].text
+    assert "each cell needs 5 episodes in the twin" in text and "validate more episodes" in text
+    assert "real trials" not in text

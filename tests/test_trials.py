@@ -13,6 +13,7 @@ from twin.evaluation.trials import (
     Trial,
     cells_csv,
     csv_text,
+    read_real_trials,
     read_results,
     read_trials,
     tally,
@@ -56,6 +57,28 @@ def test_a_results_table_with_spaces_after_its_commas_is_continued(tmp_path: Pat
     out = write(tmp_path, "policy, lighting, trials, successes, task, twin_lighting\nnerf, sun, 1, 1, straight, noon\n")
     write_real_trials(TRIALS[:2], tmp_path / "t.csv", out, "sun")
     assert out.read_text() == "policy,lighting,trials,successes,task,twin_lighting\nnerf,sun,2,1,straight,noon\n"
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ("nerf,sun,2,1,straight,sun\nnerf,sun,1,0,straight,sun\n", "line 3: nerf under sun is in .* line 2, too"),
+        ("nerf,sun,2,2,straight,sun\n", "2 of them successes, but t.csv has 1 of 2; correct outcomes there"),
+        ("nerf,sun,2,0,straight,sun\n", "0 of them successes, but t.csv has 1 of 2"),
+    ],
+)
+def test_results_corrected_by_hand_are_not_overwritten(tmp_path: Path, rows: str, message: str) -> None:
+    out, table = write(tmp_path, f"policy,lighting,trials,successes,task,twin_lighting\n{rows}"), tmp_path / "t.csv"
+    table.write_text(csv_text(EPISODE_COLUMNS, (trial.row() for trial in TRIALS)))
+    with pytest.raises(InputError, match=message):
+        read_real_trials(table, out)
+
+
+def test_a_table_written_half_is_continued(tmp_path: Path) -> None:
+    """A kill between the two files leaves the results table one trial behind."""
+    out = write(tmp_path, "policy,lighting,trials,successes,task,twin_lighting\nnerf,sun,0000001,1,straight,sun\n")
+    (tmp_path / "t.csv").write_text(csv_text(EPISODE_COLUMNS, (trial.row() for trial in TRIALS)))
+    assert read_real_trials(tmp_path / "t.csv", out) == TRIALS
 
 
 def test_cells_have_their_interval() -> None:
@@ -165,7 +188,7 @@ def test_several_tables_are_one_without_doubled_trials(tmp_path: Path) -> None:
         read_results(tables, TWIN)
 
 
-@pytest.mark.parametrize("other", ["D\u0061\u0308mmerung 1", "dämmerung  1"])
+@pytest.mark.parametrize("other", ["D\u0061\u0308mmerung 1", "dämmerung  1", "Dämmerung 1\u200b"])
 def test_a_day_has_one_spelling(tmp_path: Path, other: str) -> None:
     rows = f"nerf,Dämmerung 1,10,9,sun\nsimulator,{other},10,9,sun\n"
     twin = [cell for cell in TWIN if cell.task == "straight"]

@@ -181,6 +181,27 @@ def test_the_headline_compares_what_all_have_driven():
     assert "most often" not in verdicts(told(alike))[0].text and "“b” as often" in verdicts(told(alike))[0].text
 
 
+def test_the_headline_ranks_by_what_it_prints():
+    """Lightings count alike; equal sums are equal; and luck is not called better."""
+
+    def of(**won: dict[str, tuple[int, int]]) -> str:
+        trials = [
+            trial(policy, k, "goal" if k < good else "stuck", light=light)
+            for policy, lights in won.items()
+            for light, (good, count) in lights.items()
+            for k in range(count)
+        ]
+        return verdicts(told(trials))[0].text
+
+    uneven = of(a={"x": (10, 10), "y": (50, 100)}, b={"x": (4, 10), "y": (100, 100)})
+    assert "“a” reaches the goal most often: in 75% of episodes" in uneven and "60 of 110" not in uneven
+    assert "not significantly more often than “b”" in uneven
+    thirds = of(a={"x": (1, 10), "y": (2, 10), "z": (3, 10)}, b={"x": (3, 10), "y": (2, 10), "z": (1, 10)})
+    assert "most often" not in thirds and "“b” as often" in thirds
+    assert "not significantly" in of(a={"x": (20, 20)}, b={"x": (19, 20)})
+    assert "not significantly" not in of(a={"x": (20, 20)}, b={"x": (2, 20)})
+
+
 def test_a_weak_light_and_untrusted_pictures_are_headlines():
     trials = [*(trial("a", k) for k in range(3)), trial("a", 0, "stuck", light="night", trust=0.2)]
     first, second = verdicts(told(trials))

@@ -152,6 +152,8 @@ class Agreement:
     calibration: tuple[CalibrationBin, ...] = ()
     errors: tuple[DayErrors, ...] = ()
     ordered: tuple[OrderedPairs, ...] = ()
+    tied_pairs: int = 0
+    """Number of pairs of policies of one task with the same rate on the road; they are not in `ordered`."""
 
 
 # ---- parts that `forecasting` also uses
@@ -165,17 +167,13 @@ def missing_data(real: Sequence[Cell], twin: Cells) -> list[str]:
         more = MIN_POLICIES - policies
         driven = "1 policy" if policies == 1 else f"{policies} policies"
         out.append(f"{driven} driven on the road, {MIN_POLICIES} are needed: drive {more} more")
-    short = [
-        f"{c.policy} under {c.lighting} has {c.trials} {kind} ({MIN_TRIALS - c.trials} more)"
-        for kind, cells in (
-            ("real trials", real),
-            ("trials in the twin", dict.fromkeys(twin[cell.twin_key] for cell in real)),
-        )
-        for c in cells
-        if c.trials < MIN_TRIALS
-    ]
-    if short:
-        out.append(f"each cell needs {MIN_TRIALS} trials: {join_names(short)}; or leave these cells out")
+    for cells, what, cure in (
+        (real, "real trials", "or leave these cells out"),
+        (dict.fromkeys(twin[cell.twin_key] for cell in real), "episodes in the twin", "validate more episodes"),
+    ):
+        short = [f"{c.policy} under {c.lighting} has {c.trials}" for c in cells if c.trials < MIN_TRIALS]
+        if short:
+            out.append(f"each cell needs {MIN_TRIALS} {what}, but {join_names(short)}; {cure}")
     return out
 
 
@@ -236,7 +234,7 @@ def measure_agreement(task: str, real: Sequence[Cell], twin: Cells, further: Seq
         days=data.days,
         twin_error=Estimate(float(np.abs(rates["real"] - rates["twin"]).mean()), n=data.policies),
         **_probabilities(data, real, twin),
-        ordered=_ordered(data),
+        **_ordered(data),
     )
 
 
@@ -274,12 +272,12 @@ def _corrected_coverage(data: PairedCells) -> Estimate:
     for members in data.strata:
         f, y = rates["twin"][members], rates["real"][members]
         groups = data.training[members]
-        if len(members) - np.bincount(groups).max() < MIN_PREDICTORS:
+        if len(np.unique(groups)) <= MIN_PREDICTORS:
             continue
         _, low, high = leave_one_group_out(twin=f, real=y, groups=groups.tolist())
         hits += list(within(low, y, high)[np.isfinite(low)])
     if not hits:
-        few = f"each policy needs {MIN_PREDICTORS} policies of other trainings on its task, whose rates scatter"
+        few = f"each policy needs policies of {MIN_PREDICTORS} other trainings on its task, whose rates scatter"
         return Estimate(missing=few)
     return Estimate(float(np.mean(hits)), n=len(hits), no_interval=DEPENDENT)
 
@@ -296,6 +294,8 @@ def _mean_real(data: PairedCells, further: Sequence[float]) -> Estimate:
     except UndefinedStatistic as refusal:
         return Estimate(missing=str(refusal))
     alike = "none: the formula of the interval treats the trials of a day as independent"
+    if not 0.0 <= mean.value <= 1.0:
+        return Estimate(missing="in the twin, the policies without real trials are unlike those driven on the road")
     return Estimate(mean.value, n=data.policies + len(further), no_interval=alike)
 
 
@@ -359,17 +359,19 @@ def _twin_probabilities(data: PairedCells, real: Sequence[Cell], twin: Cells) ->
 _GAPS = (0.0, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0)  # edges of the bins of `OrderedPairs`
 
 
-def _ordered(data: PairedCells) -> tuple[OrderedPairs, ...]:
+def _ordered(data: PairedCells) -> dict[str, Any]:
     rates = data.rates()
     i, j = np.concatenate([members[np.array(np.triu_indices(len(members), 1))] for members in data.strata], 1)
     twin, real = (rates[name][i] - rates[name][j] for name in ("twin", "real"))
+    pairs = len(real)
     twin, real = (difference[np.abs(real) > _ROUNDING] for difference in (twin, real))
     tied = np.abs(twin) < _ROUNDING
     right = np.where(tied, 0.5, (twin > 0) == (real > 0))
     index = np.clip(np.searchsorted(_GAPS, np.abs(twin) + _ROUNDING, "right") - 1, 0, len(_GAPS) - 2)
     index[tied] = -1
-    return tuple(
+    ordered = tuple(
         OrderedPairs(_GAPS[max(b, 0)], _GAPS[b + 1], int(of.sum()), float(right[of].sum()))
         for b in range(-1, len(_GAPS) - 1)
         if (of := index == b).any()
     )
+    return {"ordered": ordered, "tied_pairs": pairs - len(real)}

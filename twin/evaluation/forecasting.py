@@ -303,7 +303,9 @@ def _corrected(
     out = []
     for i, mine in enumerate(cells):
         training = training_of(mine[0].policy)
-        others = [pair for j, pair in scores.items() if training_of(cells[j][0].policy) != training]
+        trainings = {j: training_of(cells[j][0].policy) for j in scores}
+        others = [pair for j, pair in scores.items() if trainings[j] != training]
+        further = len({*trainings.values()} - {training})
         if missing or len(others) < MIN_POLICIES:
             too_few = f"{len(others)} policies of other trainings driven, {MIN_POLICIES} needed"
             out.append(Estimate(missing=missing or too_few))
@@ -321,8 +323,8 @@ def _corrected(
                     "no interval: the driven policies' rates lie within 1% of one line; their scatter is not known"
                 )
                 out.append(Estimate(value, n=line.n, no_interval=on_line))
-            elif line.n < MIN_PREDICTORS:
-                few = f"too few for an interval: {line.n} policies of other trainings, {MIN_PREDICTORS} are needed"
+            elif further < MIN_PREDICTORS:  # policies of one training err alike
+                few = f"too few for an interval: {further} other trainings, {MIN_PREDICTORS} are needed"
                 out.append(Estimate(value, n=line.n, no_interval=few))
             else:
                 out.append(Estimate(value, low, high, line.n))

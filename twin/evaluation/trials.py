@@ -143,16 +143,23 @@ def cells_csv(cells: Iterable[Cell]) -> str:
 def read_real_trials(table: Path, out: Path) -> list[Trial]:
     """The real trials in `table`, if it exists.
 
-    Raises InputError: the results table `out` has further trials, which `write_real_trials` would lose.
+    Raises InputError: the results table `out` has further trials or other outcomes, which `write_real_trials` would
+    lose.
     """
     known = read_trials(table) if table.exists() else []
-    explained = Counter(trial.cell for trial in known)
+    explained = {cell.key: (cell.trials, cell.successes) for cell in tally(known)}
     for key, (where, row) in _recorded(out).items():
-        trials, mine = _parse_int(where, row, "trials"), explained[key]
+        trials, won = (_parse_int(where, row, name) for name in ("trials", "successes"))
+        mine, mine_won = explained.get(key, (0, 0))
+        what = f"{out}: {trials} trials of {key[0]} under {key[2]}"
         if trials > mine:
             raise InputError(
-                f"{out}: {trials} trials of {key[0]} under {key[2]}, but {table.name} has {mine} of them; give another "
-                "--out, and join the two files by hand"
+                f"{what}, but {table.name} has {mine} of them; give another --out, and join the two files by hand"
+            )
+        # It has fewer if a command was killed between writing the two tables.
+        if won > mine_won or trials - won > mine - mine_won:
+            raise InputError(
+                f"{what}, {won} of them successes, but {table.name} has {mine_won} of {mine}; correct outcomes there"
             )
     return known
 
@@ -184,12 +191,19 @@ def check_twin_lighting(out: Path, cell: tuple[str, str, str], wanted: str | Non
 def _recorded(out: Path) -> dict[tuple[str, str, str], tuple[str, dict[str, str]]]:
     """Location and fields of each row of a results table, by policy, task (empty if not given) and lighting.
 
-    Empty if there is no such table, or it has no rows. Names, counts and duplicates are not checked.
+    Empty if there is no such table, or it has no rows. Names and counts are not checked. Raises InputError: two rows
+    of one cell.
     """
     if not out.exists() or sum(bool(line.strip()) for line in _table_text(out).splitlines()) < 2:
         return {}
     rows = _rows(out, RESULT_COLUMNS, OPTIONAL_RESULT_COLUMNS)
-    return {(row["policy"], row.get("task", ""), row["lighting"]): (where, row) for where, row in rows}
+    found: dict[tuple[str, str, str], tuple[str, dict[str, str]]] = {}
+    for where, row in rows:
+        key = row["policy"], row.get("task", ""), row["lighting"]
+        if key in found:
+            raise InputError(f"{where}: {key[0]} under {key[2]} is in {found[key][0]}, too; make one row of the two")
+        found[key] = where, row
+    return found
 
 
 def write_real_trials(
@@ -295,9 +309,15 @@ def read_results(paths: Sequence[Path], twin: Sequence[Cell]) -> list[Cell]:
     return list(cells.values())
 
 
+_HYPHENS = str.maketrans(dict.fromkeys("‐‑‒–—−", "-"))
+
+
 def _spelling(name: str) -> str:
-    """A name without what the eye does not see: case, repeated spaces and the encoding of accents."""
-    return " ".join(unicodedata.normalize("NFC", name).casefold().split())
+    """A name without what the eye does not see: case, repeated spaces, invisible characters, and the encoding of
+    accents and hyphens.
+    """
+    seen = "".join(c for c in unicodedata.normalize("NFKC", name) if unicodedata.category(c) != "Cf")
+    return " ".join(seen.translate(_HYPHENS).casefold().split())
 
 
 def _policy_and_task(where: str, row: dict[str, str], twin: Sequence[Cell]) -> tuple[str, str]:
@@ -397,7 +417,7 @@ def _parse_int(where: str, row: dict[str, str], name: str) -> int:
     most = _MAX_SEED if name == "seed" else _MAX_COUNT
     if not (text.isascii() and text.isdecimal()):
         raise InputError(f"{where}: {name} = {text!r}; expected a whole number, 0 or more")
-    if len(text) > len(str(most)) or int(text) > most:
+    if len(text.lstrip("0")) > len(str(most)) or int(text) > most:
         raise InputError(f"{where}: {name} = {text!r}; expected at most {most:,}")
     return int(text)
 

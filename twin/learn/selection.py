@@ -156,7 +156,8 @@ def train_until_learnt(
 ) -> dict[str, Any]:
     """Trains and tests until the training ends (see the module), and saves the kept policy as that of the run.
 
-    An earlier choice is returned unchanged unless `config` asks for more steps or a higher success rate. If a call was
+    An earlier choice is returned unchanged unless `config` asks for a higher success rate, or for more steps than a
+    choice that did not reach its rate was allowed. If a call was
     killed, the next one resumes its training. Arguments and errors are those of `train`, but `watch` also receives the
     tests so far, and `writers` the tests' scores, as `tests/...`.
 

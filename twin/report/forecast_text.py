@@ -70,6 +70,7 @@ CSV_COLUMNS = (
 _RELIABLE = 0.95  # the twin's order may be believed if the road confirms it in at least this fraction of pairs
 _ENOUGH_PAIRS = 10  # fewer pairs do not suffice to confirm an order
 _POSSIBLY_BEST = 0.05  # policies with at least this probability of being the best should get further trials
+_MOST_NAMED = 6  # policies in a list of what to drive next
 _TRIALS_NEEDED = (
     f"drive {MIN_POLICIES} policies or more of different quality, {MIN_TRIALS} times or more under each lighting; "
     "include good and bad ones, chosen before their real results are known."
@@ -114,7 +115,7 @@ def verdicts(forecast: Forecast) -> list[Verdict]:
         return [Verdict("Nothing is known yet about the road: no real trials were given.", "mixed"), *leaders]
     measured = [group for group in forecast.groups if not group.missing]
     if not measured:
-        first = f"Too few real trials to measure how well the twin predicts the road: {forecast.groups[0].missing[0]}."
+        first = f"Too few data to measure how well the twin predicts the road: {forecast.groups[0].missing[0]}."
         return [Verdict(first, "bad"), *leaders]
     group = measured[-1]  # the group of all measured tasks, or of the only one
     return [
@@ -124,7 +125,7 @@ def verdicts(forecast: Forecast) -> list[Verdict]:
         _bias(group),
         *_skill(group),
         *(
-            Verdict(f"Too few real trials to say how well the twin predicts {other.task}: {other.missing[0]}.", "mixed")
+            Verdict(f"Too few data to say how well the twin predicts {other.task}: {other.missing[0]}.", "mixed")
             for other in forecast.groups
             if other.missing
         ),
@@ -137,6 +138,8 @@ def believable(group: Agreement) -> Verdict:
     pairs = [(it.low, it.pairs, it.right) for it in group.ordered if it.high]
     many, days = counted(group.trainings, "training"), counted(group.days, "day")
     where = f"measured on {days} and {many}"
+    alike = f"; {counted(ties, 'further pair')} had the same rate in the twin" if ties else ""
+    alike += f"; {counted(group.tied_pairs, 'further pair')} had the same rate on the road" if group.tied_pairs else ""
     if not pairs and not ties:
         text = f"These policies do not differ on the road, so no order in the twin could be confirmed ({where})."
         return Verdict(text, "bad")
@@ -147,18 +150,16 @@ def believable(group: Agreement) -> Verdict:
             closer = [(m, r) for low, m, r in pairs if low < start]
             m, r = sum(m for m, _ in closer), sum(r for _, r in closer)
             gap = f"that differ by {100 * start:.0f} percentage points or more" if start else "that differ at all"
-            rest = f", and in {r:g} of {m} closer pairs" if m else ""
-            rest += f"; {counted(ties, 'further pair')} had the same rate in the twin" if ties else ""
+            rest = (f", and in {r:g} of {m} closer pairs" if m else "") + alike
             text = (
                 f"What may be believed: the order of two policies {gap} in the twin. The road had the same order in "
                 f"{right:g} of {n} such pairs{rest} ({where})."
             )
-            enough = group.trainings >= MIN_TRAININGS and group.days >= MIN_DAYS
+            enough = group.trainings >= MIN_TRAININGS and group.days >= MIN_DAYS and group.tied_pairs <= n
             return Verdict(text, "good" if enough and start <= _SMALL_GAP else "mixed")
     n, right = sum(n for _, n, _ in pairs), sum(right for _, _, right in pairs)
     text = f"No order of two policies in the twin may be believed yet: the road agrees in {right:g} of {n} pairs"
-    text += f", and {counted(ties, 'further pair')} had the same rate in the twin" if ties else ""
-    return Verdict(f"{text} ({where}).", "bad")
+    return Verdict(f"{text}{alike} ({where}).", "bad")
 
 
 def _agreement(groups: Sequence[Agreement]) -> Verdict:
@@ -234,7 +235,12 @@ def _skill(group: Agreement) -> list[Verdict]:
 
 
 def _leader(forecast: Forecast, task: str) -> Verdict:
-    first = forecast.candidates_of(task)[0]
+    first, *others = forecast.candidates_of(task)
+    # Sampling orders policies with the same counts by chance.
+    equal = [c.policy for c in others if (c.twin.value, c.twin.n) == (first.twin.value, first.twin.n)]
+    if equal:
+        names = join_names(sorted(f"“{name}”" for name in (first.policy, *equal)), 6)
+        return Verdict(f"In the twin, on {task}, {names} lead with the same rate: {format_estimate(first.twin, True)}.")
     chance = f"best there with {format_probability(first.twin_ranks[0])} probability"
     sure = chance if len(first.twin_ranks) > 1 else "the only policy"
     return Verdict(f"In the twin, on {task}, “{first.policy}” leads: {format_estimate(first.twin, True)}, {sure}.")
@@ -246,7 +252,7 @@ def _leader(forecast: Forecast, task: str) -> Verdict:
 def limitations(forecast: Forecast) -> list[Caution]:
     """Limits of the forecast, with cures."""
     out = [
-        Caution(f"{group.task}: no correlation is given because there are {what}.", _TRIALS_NEEDED)
+        Caution(f"{group.task}: no correlation is given: {what}.", _TRIALS_NEEDED)
         for group in forecast.groups
         for what in group.missing
     ]
@@ -266,7 +272,7 @@ def limitations(forecast: Forecast) -> list[Caution]:
         out.append(Caution(what, cure))
     for group in forecast.groups:
         if group.spearman.no_interval:
-            what = f"{group.task}: correlations have no interval ({group.spearman.no_interval})."
+            what = f"{group.task}: Spearman’s correlation has no interval ({group.spearman.no_interval})."
             out.append(Caution(what, "drive on further days, and with policies of further trainings."))
     lightings = join_names(sorted({name for c in forecast.candidates for name in c.lightings}))
     cure = (
@@ -308,18 +314,20 @@ def next_trials(forecast: Forecast) -> list[str]:
             names = join_names([c.policy for c in some if not c.driven], MIN_POLICIES)
             out.append(f"{task}: drive {names}, {MIN_TRIALS} times or more in each lighting.")
             continue
-        best = [c for c in driven if c.real_ranks and c.real_ranks[0] >= _POSSIBLY_BEST]
+        ranked = sorted((c for c in driven if c.real_ranks), key=lambda c: -c.real_ranks[0])
+        best = [c for c in ranked if c.real_ranks[0] >= _POSSIBLY_BEST]
+        if not best or (len(best) == 1 and best[0].real_ranks[0] <= 0.5):
+            best = ranked[:_MOST_NAMED]
         if len(best) > 1:
-            odds = join_names([f"{c.policy} ({format_probability(c.real_ranks[0])})" for c in best], 6)
+            odds = join_names([f"{c.policy} ({format_probability(c.real_ranks[0])})" for c in best], _MOST_NAMED)
             out.append(
                 f"{task}: drive these again; each may be the best policy, with the probability in parentheses: {odds}."
             )
         elif best:
             out.append(f"{task}: drive {best[0].policy} on further days, in new lightings; it is probably the best.")
         if unseen := [c.policy for c in mine if not c.driven]:
-            out.append(
-                f"{task}: drive the policies without real trials, best in the twin first: {join_names(unseen, 6)}."
-            )
+            names = join_names(unseen, _MOST_NAMED)
+            out.append(f"{task}: drive the policies without real trials, best in the twin first: {names}.")
     return out
 
 

@@ -5,6 +5,7 @@
 """
 
 from collections.abc import Mapping, Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -118,7 +119,10 @@ def p_value_text(p: float) -> str:
 
 def verdicts(results: dict[str, Any]) -> list[Verdict]:
     """The headlines: each task's best policy and its worst lighting, and the number of episodes with low trust."""
-    out = [_task_verdict(task, [c for c in results["cells"] if c["task"] == task]) for task in tasks(results)]
+    out = []
+    for task in tasks(results):
+        cells, pairs = ([one for one in results[key] if one["task"] == task] for key in ("cells", "pairs"))
+        out.append(_task_verdict(task, cells, pairs))
     low, of = (sum(c[k]["trials"] for c in results["cells"]) for k in ("low_trust", "trusted"))
     if low:
         text = f"In {low} of {low + of} episodes the pictures have low trust; these are counted separately below."
@@ -126,7 +130,7 @@ def verdicts(results: dict[str, Any]) -> list[Verdict]:
     return out
 
 
-def _task_verdict(task: str, cells: list[dict[str, Any]]) -> Verdict:
+def _task_verdict(task: str, cells: list[dict[str, Any]], pairs: list[dict[str, Any]]) -> Verdict:
     lightings: dict[str, set[str]] = {}
     for c in cells:
         lightings.setdefault(c["policy"], set()).add(c["lighting"])
@@ -135,17 +139,27 @@ def _task_verdict(task: str, cells: list[dict[str, Any]]) -> Verdict:
     if not common:
         return Verdict(f"On {task} no lighting was used for all policies, so the best policy is not known.", "mixed")
     shared = {policy: [c for c in cells if c["policy"] == policy and c["lighting"] in common] for policy in lightings}
-    means = {policy: sum(c["rate"] for c in mine) / len(common) for policy, mine in shared.items()}
+    means = {
+        policy: sum(Fraction(c["successes"], c["trials"]) for c in mine) / len(common)
+        for policy, mine in shared.items()
+    }
     best = max(means, key=lambda policy: means[policy])
     won, of = (sum(c[key] for c in shared[best]) for key in ("successes", "trials"))
     tied = [policy for policy in means if means[policy] == means[best] and policy != best]
     lead = " most often" if len(means) > 1 and not tied else ""
-    text = f"On {task}, “{best}” reaches the goal{lead}: in {won} of {of} episodes"
+    # Lightings count alike, also if more episodes were driven in one of them.
+    pooled = Fraction(won, of) == means[best]
+    count = f"in {won} of {of} episodes" if pooled else f"in {float(means[best]):.0%} of episodes"
+    text = f"On {task}, “{best}” reaches the goal{lead}: {count}"
     every = dict.fromkeys(c["lighting"] for c in cells)
     if len(common) < len(every):
         names = join_names(name for name in every if name in common)
         text += f" in the lightings that were used for all policies ({names})"
     text += f", and {join_names(f'“{name}”' for name in tied)} as often" if tied else ""
+    of_best = [p for p in pairs if best in (p["a"], p["b"]) and pair_text(p) != f"“{best}” is better"]
+    unclear = [p["b"] if p["a"] == best else p["a"] for p in of_best]
+    if lead and unclear:
+        text += f", which is not significantly more often than {join_names(f'“{name}”' for name in unclear)}"
     weakest = min(shared[best], key=lambda c: c["rate"])
     if weakest["rate"] < max(c["rate"] for c in shared[best]):
         text += f"; least often in lighting {weakest['lighting']}, {weakest['successes']} of {weakest['trials']}"
