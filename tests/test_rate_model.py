@@ -123,6 +123,16 @@ def test_samples_follow_the_posterior() -> None:
     assert np.allclose(((low <= samples) & (samples <= high)).mean(0), 0.9, atol=0.02)
 
 
+def test_hundreds_of_days_are_no_rate_of_zero() -> None:
+    """Two policies of rate 1/2, one alike within each day and one not: no ρ fits both."""
+    won = np.array([[0, 10] * 200, [5, 5] * 200])
+    for shared in (False, True):
+        model = RateModel.fit(won, np.full(won.shape, 10), shared_days=shared)
+        assert model.mean() == pytest.approx([0.5, 0.5], abs=0.05)
+        samples = model.sample(np.random.default_rng(0), 1000).mean(0)
+        assert samples == pytest.approx([0.5, 0.5], abs=0.05)
+
+
 def test_cells_are_shrunk_towards_their_policy() -> None:
     means = RateModel.fit([[5, 0, 5, 5], [0, 0, 0, 5]], np.full((2, 4), 5), shared_days=False).cell_means()
     assert means[0, 1] < 0.5 < means[0, 0] and means[0, 1] > means[1, 0]

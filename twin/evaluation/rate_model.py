@@ -66,12 +66,14 @@ class RateModel:
     trials: Array
     """Trials in each cell, shape (n, k); 0 in padding."""
     likelihood: Array
-    """Likelihood of each policy's cells given its rate (axis g) and ρ (axis r), up to a factor per policy, shape
-    (n, g, r)."""
+    """Likelihood of each policy's cells given its rate (axis g) and ρ (axis r), relative to its maximum over rates,
+    shape (n, g, r)."""
+    maximum: Array
+    """Logarithm of this maximum, shape (n, r)."""
     prior: Array
     """Prior mass of the grid's rates for each combination h of μ, τ and β, shape (n or 1, h, g)."""
     evidence: Array
-    """Likelihood of each policy's cells for each h and ρ, shape (n, h, r)."""
+    """Log-likelihood of each policy's cells for each h and ρ, shape (n, h, r)."""
     weight: Array
     """Posterior mass of each h and ρ, shape (h, r)."""
     correlations: Array
@@ -102,7 +104,9 @@ class RateModel:
         if won.shape != driven.shape or not len(won) or (won < 0).any() or (won > driven).any():
             raise ValueError(f"successes {won.shape} of trials {driven.shape}: expected 0 ≤ successes ≤ trials, (n, k)")
         days = (driven > 0).sum(-1).max()
-        likelihood = _likelihood(won, driven) ** ((2 * days - 1) / (2 * days + 1) if shared_days else 1.0)
+        logs = _log_likelihood(won, driven) * ((2 * days - 1) / (2 * days + 1) if shared_days else 1.0)
+        maximum = logs.max(1)  # for each ρ: with hundreds of days the likelihoods of some ρ are too small for a float
+        likelihood = np.exp(logs - maximum[:, None])
         slopes = np.zeros(1) if covariate is None else np.array(_SLOPES)
         given = np.zeros(1) if covariate is None else np.asarray(covariate, float)
         x = given - given.mean()
@@ -110,13 +114,14 @@ class RateModel:
         centers = expit(logit(mean) + slope * x[:, None])
         a, b = _beta(np.clip(centers, 1e-4, 1 - 1e-4), correlation)
         prior = np.diff(betainc(a[..., None], b[..., None], _EDGES), axis=-1)
-        evidence = np.maximum(np.matmul(prior, likelihood), 1e-300)
-        log = np.log(evidence).sum(0)
+        evidence = np.log(np.maximum(np.matmul(prior, likelihood), 1e-300)) + maximum[:, None]
+        log = evidence.sum(0)
         correlations = _CORRELATIONS ** (_ALL_OR_NONE if all_or_none else 0.0)
         weight = np.exp(log - log.max()) * correlations
         others = max(int((driven.sum(-1) > 0).sum()) - 1, 0)
         power = 1.0 / (1.0 + _shared_effect(won, driven) * others) if shared_days else 1.0
-        return RateModel(won, driven, likelihood, prior, evidence, weight / weight.sum(), correlations, power)
+        weight /= weight.sum()
+        return RateModel(won, driven, likelihood, maximum, prior, evidence, weight, correlations, power)
 
     def posterior(self) -> Array:
         """Mass of the grid's rates for each policy, shape (n, g)."""
@@ -124,9 +129,8 @@ class RateModel:
 
     def _joint(self) -> Array:
         """Mass of the grid's rates and ρ for each policy, shape (n, g, r)."""
-        log = np.log(self.evidence)
-        others = self.power * (log.sum(0) - log)
-        scaled = np.exp(others - others.max((1, 2), keepdims=True)) * self.correlations
+        log = self.power * (self.evidence.sum(0) - self.evidence) + self.maximum[:, None]
+        scaled = np.exp(log - log.max((1, 2), keepdims=True)) * self.correlations
         prior = np.broadcast_to(self.prior, (len(scaled), *self.prior.shape[1:]))
         mass = np.matmul(np.swapaxes(prior, 1, 2), scaled) * self.likelihood
         return np.asarray(mass / mass.sum((-1, -2), keepdims=True))
@@ -187,16 +191,15 @@ def _beta(mean: Array, correlation: Array) -> tuple[Array, Array]:
     return mean * size, (1.0 - mean) * size
 
 
-def _likelihood(won: Array, driven: Array) -> Array:
-    """Product over cells of the beta-binomial likelihood, shape (n, g, r), at most 1 for each policy."""
+def _log_likelihood(won: Array, driven: Array) -> Array:
+    """Sum over cells of the beta-binomial log-likelihood, up to a term per policy, shape (n, g, r)."""
     a, b = _beta(_RATES[:, None], _CORRELATIONS[None])
     pairs, index = np.unique(np.stack([won.ravel(), driven.ravel()], -1), axis=0, return_inverse=True)
     y, m = pairs[:, 0, None, None], pairs[:, 1, None, None]
     table = betaln(a + y, b + m - y) - betaln(a, b)
     counts = np.zeros((len(won), len(pairs)))
     np.add.at(counts, (np.repeat(np.arange(len(won)), won.shape[1]), index.ravel()), 1.0)
-    log = np.tensordot(counts, table, 1)
-    return np.asarray(np.exp(log - log.max((1, 2), keepdims=True)))
+    return np.asarray(np.tensordot(counts, table, 1))
 
 
 def _shortest(mass: Array, edges: Array) -> tuple[float, float]:
