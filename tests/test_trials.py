@@ -76,7 +76,7 @@ def test_results_corrected_by_hand_are_not_overwritten(tmp_path: Path, rows: str
 
 def test_a_table_written_half_is_continued(tmp_path: Path) -> None:
     """A kill between the two files leaves the results table one trial behind."""
-    out = write(tmp_path, "policy,lighting,trials,successes,task,twin_lighting\nnerf,sun,0000001,1,straight,sun\n")
+    out = write(tmp_path, "policy,lighting,trials,successes,task,twin_lighting\nnerf,sun,0000000001,1,straight,sun\n")
     (tmp_path / "t.csv").write_text(csv_text(EPISODE_COLUMNS, (trial.row() for trial in TRIALS)))
     assert read_real_trials(tmp_path / "t.csv", out) == TRIALS
 
