@@ -719,7 +719,8 @@ def test_a_prediction_interval_needs_other_trainings_and_not_more_checkpoints() 
         return make_forecast("road", *on_days(real, rates))
 
     few = made([f"r{i % 2}/{i:09d}" for i in range(16)])
-    assert all("1 other trainings, 7 are needed" in c.corrected.no_interval for c in few.candidates)
+    assert all("too few other trainings for an interval: 1, 7" in c.corrected.no_interval for c in few.candidates)
+    assert "Without an interval: too few other trainings for an interval: 1, 7 are" in Text(forecast_page(few)).text
     assert few.groups[0].corrected_coverage.missing
     many = made([f"r{i}" for i in range(9)])
     assert all(c.corrected.low is not None for c in many.candidates)

@@ -324,7 +324,7 @@ def _corrected(
                 )
                 out.append(Estimate(value, n=line.n, no_interval=on_line))
             elif further < MIN_PREDICTORS:  # policies of one training err alike
-                few = f"too few for an interval: {further} other trainings, {MIN_PREDICTORS} are needed"
+                few = f"too few other trainings for an interval: {further}, {MIN_PREDICTORS} are needed"
                 out.append(Estimate(value, n=line.n, no_interval=few))
             else:
                 out.append(Estimate(value, low, high, line.n))
