@@ -12,11 +12,11 @@ A Beta distribution with mean p and intra-class correlation ρ is Beta(p/ρ − 
 trials of a day have the same outcome; with ρ = 0, they are independent. The priors are Beta(5, 1) of ρ, since on most
 days all trials of a policy have the same outcome (706 of 720 cells in docs/benchmarks.md), Beta(1, 2) of τ, and
 Beta(3/2, 3/2) of μ. With uniform priors and Jeffreys' prior of μ, all successes on a few days suggested that a policy
-always succeeds: 90 % intervals from two to four days had coverages of 0.74 to 0.83 where weather changes a lot. All
-policies share ρ. All parameters are integrated over a grid, so intervals need neither sampling nor a seed. A policy's
-rate is shrunk towards the rates of the other policies, more strongly if these are alike; it is not shrunk towards one
-half. The beta-binomial distribution is Skellam's (J. R. Stat. Soc. B 10, 1948); for hierarchical models see Gelman et
-al., Bayesian Data Analysis, section 5.3.
+always succeeds: 90 % intervals from two to four days had coverages of 0.74 to 0.83 where weather changes a lot (script
+not kept). All policies share ρ. All parameters are integrated over a grid, so intervals need neither sampling nor a
+seed. A policy's rate is shrunk towards the rates of the other policies, more strongly if these are alike; it is not
+shrunk towards one half. The beta-binomial distribution is Skellam's (J. R. Stat. Soc. B 10, 1948); for hierarchical
+models see Gelman et al., Bayesian Data Analysis, section 5.3.
 
 Policies of one experiment drive on the same days, and a bad day is bad for all of them. So their cells are not
 independent, and the product of their likelihoods is a *composite* likelihood. It is raised to the power

@@ -157,9 +157,9 @@ def train_until_learnt(
     """Trains and tests until the training ends (see the module), and saves the kept policy as that of the run.
 
     An earlier choice is returned unchanged unless `config` asks for a higher success rate, or for more steps than a
-    choice that did not reach its rate was allowed. If a call was
-    killed, the next one resumes its training. Arguments and errors are those of `train`, but `watch` also receives the
-    tests so far, and `writers` the tests' scores, as `tests/...`.
+    choice that did not reach its rate was allowed. If a call was killed, the next one resumes its training. Arguments
+    and errors are those of `train`, but `watch` also receives the tests so far, and `writers` the tests' scores, as
+    `tests/...`.
 
     Returns:
         The contents of `choice.json`: the steps done and allowed; the required success rate and whether it is reached;

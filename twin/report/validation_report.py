@@ -147,9 +147,9 @@ def _task_verdict(task: str, cells: list[dict[str, Any]], pairs: list[dict[str, 
     won, of = (sum(c[key] for c in shared[best]) for key in ("successes", "trials"))
     tied = [policy for policy in means if means[policy] == means[best] and policy != best]
     lead = " most often" if len(means) > 1 and not tied else ""
-    # Lightings count alike, also if more episodes were driven in one of them.
     pooled = Fraction(won, of) == means[best]
-    count = f"in {won} of {of} episodes" if pooled else f"in {float(means[best]):.0%} of episodes"
+    alike = f"in {float(means[best]):.0%} of episodes, if every lighting has the same weight"
+    count = f"in {won} of {of} episodes" if pooled else alike
     text = f"On {task}, “{best}” reaches the goal{lead}: {count}"
     every = dict.fromkeys(c["lighting"] for c in cells)
     if len(common) < len(every):
